@@ -1,0 +1,1 @@
+"""Controllers that the bench is delivered with: clients of its public interface."""

@@ -1,0 +1,169 @@
+"""The one door through which every controller is driven, and how a controller is found by name."""
+
+import importlib
+import re
+import sys
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Literal, NamedTuple, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
+from wbc_bench.robot import Robot
+
+Array = NDArray[np.float64]
+Signal = Literal["proprioception", "ee_pose", "base_pose", "privileged"]
+SIGNALS: tuple[Signal, ...] = get_args(Signal)
+DEPLOYABLE: frozenset[Signal] = frozenset({"proprioception", "ee_pose"})  # what the paper's policy may see
+ENTRY_POINTS = "wbc_bench.controllers"
+
+
+class ControllerInfo(NamedTuple):
+    """What a controller says of itself; signals it does not declare are not passed to it."""
+
+    name: str
+    signals: frozenset[Signal]
+    control_period: float  # [s]
+    source: str  # paper, package or file it comes from
+
+
+class Proprioception(NamedTuple):
+    """Noisy onboard measurements of N robots."""
+
+    base_ang_vel_b: Array  # (N, 3) [rad/s] gyro
+    gravity_b: Array  # (N, 3) unit vector pointing down, in the base frame
+    joint_pos: Array  # (N, 14) [rad]
+    joint_vel: Array  # (N, 14) [rad/s]
+    joint_torque: Array  # (N, 14) [N m] estimated from motor current
+
+
+class EePose(NamedTuple):
+    """Noisy end-effector pose in the base frame."""
+
+    pos_b: Array  # (N, 3) [m]
+    rot6_b: Array  # (N, 6) first two columns of the rotation
+
+
+class BasePose(NamedTuple):
+    """True pose and velocity of the base."""
+
+    pos_w: Array  # (N, 3) [m]
+    rot_w: Array  # (N, 3, 3)
+    lin_vel_w: Array  # (N, 3) [m/s]
+
+
+class Privileged(NamedTuple):
+    """What only a simulation knows."""
+
+    friction: Array  # (N,)
+    base_mass: Array  # (N,) [kg] added to the base
+    kp_scale: Array  # (N, 14)
+    kd_scale: Array  # (N, 14)
+    foot_force_w: Array  # (N, 2, 3) [N] ground on left and right sole
+    base_lin_vel_b: Array  # (N, 3) [m/s]
+
+
+class Observation(NamedTuple):
+    """What a controller sees of N episodes at one control step; undeclared signals are None."""
+
+    time: float  # [s] since the start of the episode
+    active: NDArray[np.bool_]  # (N,) episodes still running; commands of the others are ignored
+    proprioception: Proprioception | None
+    ee_pose: EePose | None
+    base_pose: BasePose | None
+    privileged: Privileged | None
+
+
+class Target(NamedTuple):
+    """The end-effector pose asked for, in the instantaneous base frame."""
+
+    pos_b: Array  # (N, 3) [m]
+    rot_b: Array  # (N, 3, 3)
+
+
+class JointCommand(NamedTuple):
+    """What the 500 Hz PD loop tracks until the next control step."""
+
+    q: Array  # (N, 14) [rad]
+    infeasible: NDArray[np.bool_] | None = None  # (N,) steps on which a solver found nothing
+
+
+class Controller(Protocol):
+    """A batched controller. It is built by calling its factory with the `Robot` it will drive."""
+
+    info: ControllerInfo
+
+    def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
+        """Forget everything and start the episodes with these numbers, (N,)."""
+        ...
+
+    def act(self, obs: Observation, target: Target) -> JointCommand:
+        """The commands of one control step."""
+        ...
+
+
+def controllers() -> dict[str, EntryPoint]:
+    """Installed controllers by name."""
+    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+
+def load_controller(spec: str, robot: Robot) -> Controller:
+    """The controller that SPEC names, built for a robot.
+
+    SPEC is `name` or `name:variant` of an installed controller, or `module:attribute` of a user's own, the
+    module importable or a file `path/to/file.py:attribute`. An installed factory is called with
+    `(robot, variant)`, a user's with `(robot)`.
+
+    Raises:
+        UnknownNameError: no installed controller of that name (with the nearest names).
+        ControllerError: it cannot be imported or built, or declares a signal that does not exist.
+    """
+    name, _, rest = spec.partition(":")
+    installed = controllers()
+    try:
+        if name in installed:
+            controller = installed[name].load()(robot, rest)
+        elif rest:
+            controller = _load_attribute(name, rest)(robot)
+        else:
+            raise UnknownNameError("controller", spec, installed, "--controller; or give module:attribute")
+    except BenchError:
+        raise
+    except ImportError as error:
+        raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
+    info = getattr(controller, "info", None)
+    if not isinstance(info, ControllerInfo):
+        raise ControllerError(f"controller '{spec}' has no `info`, valid: a wbc_bench.controller.ControllerInfo")
+    for signal in sorted(info.signals):
+        if signal not in SIGNALS:
+            raise UnknownNameError("signal", signal, SIGNALS, f"declared by controller '{spec}'")
+    return controller
+
+
+def slug(spec: str) -> str:
+    """A folder name for a controller spec."""
+    return re.sub(r"[^A-Za-z0-9._@-]+", "-", spec).strip("-")
+
+
+def _load_attribute(module: str, attribute: str):
+    if module.endswith(".py"):
+        path = Path(module).resolve()
+        if not path.exists():
+            raise ControllerError(f"controller file '{module}' does not exist")
+        folder, module = str(path.parent), path.stem
+    else:
+        folder = str(Path.cwd())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise
+        raise UnknownNameError(
+            "controller", module, controllers(), "--controller; no such module either"
+        ) from error
+    except AttributeError as error:
+        raise ControllerError(f"controller '{module}:{attribute}': module has no '{attribute}'") from error

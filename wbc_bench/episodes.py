@@ -1,0 +1,39 @@
+"""What an evaluation leaves behind: the time series of a shard of episodes and how each ended."""
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+STRATA = ("arm", "posture", "step")
+
+
+class Outcome(enum.StrEnum):
+    """How an episode ended; every episode has exactly one, so that counts add up to the episodes asked for."""
+
+    SUCCESS = "success"  # both errors inside the tolerance at every step of the final window
+    FELL = "fell"  # the base tilted or sank past the termination limits
+    ILLEGAL_CONTACT = "illegal_contact"  # base, shank or arm touched the ground
+    MISSED = "missed"  # stood, and was never inside the tolerance
+    DRIFTED = "drifted"  # was inside the tolerance, and did not hold it through the window
+    QP_INFEASIBLE = "qp_infeasible"  # stood, off target, its solver without a solution in the window
+    INVALID = "invalid"  # the controller answered NaN, or the simulation diverged
+
+
+TERMINATED = (Outcome.FELL, Outcome.ILLEGAL_CONTACT, Outcome.INVALID)
+
+
+@dataclass(frozen=True)
+class EpisodeBatch:
+    """Time series of N episodes of at most T control steps; NaN after the end of an episode."""
+
+    control_period: float  # [s]
+    window: int  # control steps in the success window
+    steps: NDArray[np.int64]  # (N,) control steps completed
+    outcome: NDArray[np.object_]  # (N,) Outcome
+    position_error: NDArray[np.float64]  # (N, T) [m]
+    orientation_error: NDArray[np.float64]  # (N, T) [rad]
+    action: NDArray[np.float64]  # (N, T, 14) normalised: (command - default) / scale
+    ee_pos_w: NDArray[np.float64]  # (N, T, 3) [m] end-effector in the world
+    infeasible_steps: NDArray[np.int64]  # (N,) control steps on which the controller had no solution

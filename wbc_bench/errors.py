@@ -1,0 +1,34 @@
+"""Errors a user can cause. Each is one line: the value, what is valid, and where it came from."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class BenchError(Exception):
+    """A mistake in the input; the command line prints it in one line and exits with code 2."""
+
+
+class UnknownNameError(BenchError):
+    """A name that is not in a list of valid ones, with the nearest of them."""
+
+    def __init__(self, kind: str, name: str, valid: Iterable[str], where: str) -> None:
+        names = sorted(valid)
+        near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}? " if near else ""
+        super().__init__(f"unknown {kind} '{name}' ({where}): {hint}valid: {', '.join(names) or 'none'}")
+
+
+class ProtocolError(BenchError):
+    """A protocol file that cannot be read or asks for the impossible."""
+
+
+class ManifestError(BenchError):
+    """A manifest that is missing, altered, or does not belong to its protocol."""
+
+
+class ControllerError(BenchError):
+    """A controller that cannot be loaded or breaks the interface."""
+
+
+class StoreError(BenchError):
+    """A results folder that cannot be used, or records that must not be mixed."""

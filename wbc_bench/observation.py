@@ -1,0 +1,99 @@
+"""What a controller may see: measurements with the protocol's noise, and the target in the base frame."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wbc_bench.controller import (
+    BasePose,
+    EePose,
+    Observation,
+    Privileged,
+    Proprioception,
+    Signal,
+    Target,
+)
+from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.protocol import EvalProtocol
+from wbc_bench.randomness import stream
+from wbc_bench.robot import NUM_JOINTS
+from wbc_bench.rotations import matrix_from_wxyz, rho6
+from wbc_bench.simulation import State
+
+Array = NDArray[np.float64]
+_WIDTHS = {  # signals with noise, in the order of their columns
+    "base_ang_vel": 3,
+    "gravity": 3,
+    "joint_pos": NUM_JOINTS,
+    "joint_vel": NUM_JOINTS,
+    "joint_torque": NUM_JOINTS,
+    "ee_pos": 3,
+    "ee_rot": 6,
+}
+
+
+class Sensors:
+    """Turns true states of N episodes into observations.
+
+    Noise is uniform and is drawn for a whole episode at once from the episode's own stream, so that it depends
+    neither on the batch nor on when another episode ends. Source: paper, section III-A (uniform noise).
+    """
+
+    def __init__(self, protocol: EvalProtocol, rows: EpisodeManifest, signals: frozenset[Signal]) -> None:
+        self._rows, self._signals = rows, signals
+        half = np.concatenate(
+            [np.full(width, getattr(protocol.noise, name)) for name, width in _WIDTHS.items()]
+        )
+        self._columns, start = {}, 0
+        for name, width in _WIDTHS.items():
+            self._columns[name] = slice(start, start + width)
+            start += width
+        self._noise = None
+        if half.any() and signals & {"proprioception", "ee_pose"}:
+            shape = (protocol.num_steps + 1, len(half))
+            self._noise = np.stack(
+                [
+                    stream(int(key), "noise").uniform(-1, 1, shape) * (half * scale)
+                    for key, scale in zip(rows.noise_key, rows.noise_scale, strict=True)
+                ],
+                axis=1,
+            )  # (T + 1, N, columns)
+        self._target_rot_w = matrix_from_wxyz(rows.target_quat_w)
+
+    def observe(self, step: int, time: float, state: State, active: NDArray[np.bool_]) -> Observation:
+        """The observation at control step `step`, time [s]."""
+
+        def noisy(name: str, value: Array) -> Array:
+            return value if self._noise is None else value + self._noise[step][:, self._columns[name]]
+
+        rot_w, rows, signals = state.base_rot_w, self._rows, self._signals
+        proprioception = ee_pose = base_pose = privileged = None
+        if "proprioception" in signals:
+            proprioception = Proprioception(
+                base_ang_vel_b=noisy("base_ang_vel", state.base_ang_vel_b),
+                gravity_b=noisy("gravity", -rot_w[:, 2]),  # R^T (0, 0, -1)
+                joint_pos=noisy("joint_pos", state.joint_pos),
+                joint_vel=noisy("joint_vel", state.joint_vel),
+                joint_torque=noisy("joint_torque", state.joint_torque),
+            )
+        if "ee_pose" in signals:
+            pos_b = np.einsum("nji,nj->ni", rot_w, state.ee_pos_w - state.base_pos_w)
+            rot_b = np.swapaxes(rot_w, 1, 2) @ state.ee_rot_w
+            ee_pose = EePose(noisy("ee_pos", pos_b), noisy("ee_rot", rho6(rot_b)))
+        if "base_pose" in signals:
+            base_pose = BasePose(state.base_pos_w, rot_w, state.base_lin_vel_w)
+        if "privileged" in signals:
+            privileged = Privileged(
+                friction=rows.friction,
+                base_mass=rows.base_mass,
+                kp_scale=rows.kp_scale,
+                kd_scale=rows.kd_scale,
+                foot_force_w=state.foot_force_w,
+                base_lin_vel_b=np.einsum("nji,nj->ni", rot_w, state.base_lin_vel_w),
+            )
+        return Observation(time, active.copy(), proprioception, ee_pose, base_pose, privileged)
+
+    def target(self, state: State) -> Target:
+        """The target of each episode in its instantaneous base frame."""
+        rot_w = state.base_rot_w
+        pos_b = np.einsum("nji,nj->ni", rot_w, self._rows.target_pos_w - state.base_pos_w)
+        return Target(pos_b, np.swapaxes(rot_w, 1, 2) @ self._target_rot_w)

@@ -1,0 +1,229 @@
+"""The evaluation protocol: everything that two evaluations must share to be compared.
+
+A protocol is a TOML file; every field is checked when it is decoded, and a mistake names the field's path.
+Its digest covers the meaning of the file, not its layout or comments.
+"""
+
+import hashlib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+
+from wbc_bench.errors import ProtocolError, UnknownNameError
+from wbc_bench.robot import RobotConfig
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NonNegative = Annotated[float, msgspec.Meta(ge=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+Range = tuple[float, float]  # (low, high)
+
+PROTOCOL_DIR = Path(__file__).with_name("protocols")
+
+
+class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    pass
+
+
+class Episodes(_Table, frozen=True):
+    """How many episodes, how long, and the seed of every draw in them."""
+
+    replicates: Count
+    per_replicate: Count
+    horizon: Positive  # [s]
+    seed: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class Physics(_Table, frozen=True):
+    """PD runs at every physics step; the controller at every `decimation`-th."""
+
+    timestep: Positive = 0.002  # [s]
+    decimation: Count = 10
+
+
+class WorkspaceTargets(_Table, frozen=True, tag="workspace"):
+    """Targets all over the whole-body workspace, in equal parts or by weight of stratum.
+
+    Ranges are of candidate poses about the initial base, heights above the ground.
+    """
+
+    x: Range  # [m]
+    y: Range  # [m]
+    height: Range  # [m]
+    roll: Range  # [rad]
+    pitch: Range  # [rad]
+    yaw: Range  # [rad]
+    weights: dict[Literal["arm", "posture", "step"], Count]
+    step_distance: Range  # [m] how far the stance of a `step` target is displaced
+    step_yaw: Range  # [rad] and how far it is turned
+    com_margin: NonNegative = 0.02  # [m] of the centre of mass inside the soles' hull
+
+
+class ReachTargets(_Table, frozen=True, tag="reach"):
+    """Targets straight ahead over a ladder of heights."""
+
+    heights: tuple[float, float, Positive]  # [m] (lowest, highest, spacing)
+    per_height: Count
+    dither: NonNegative  # [m] uniform offset of each episode's target, so that no two are the same
+    orientations: tuple[Literal["free", "horizontal"], ...]
+    conditions: tuple[Literal["nominal", "randomised"], ...]
+    com_margin: NonNegative = 0.02  # [m]
+
+
+class Randomization(_Table, frozen=True):
+    """Ranges of the uniform draws of an episode. Source: the paper names the quantities, not the ranges."""
+
+    friction: Range = (0.8, 0.8)  # sliding coefficient
+    base_mass: Range = (0.0, 0.0)  # [kg] added to the base
+    base_lin_vel: NonNegative = 0.0  # [m/s] at reset, each axis +-
+    base_ang_vel: NonNegative = 0.0  # [rad/s]
+    leg_q: NonNegative = 0.0  # [rad] about the default posture
+    leg_qd: NonNegative = 0.0  # [rad/s]
+    gain: Range = (1.0, 1.0)  # factor on kp and on kd, one a joint
+
+
+class Push(_Table, frozen=True):
+    """Jumps of the base's horizontal velocity."""
+
+    speed: NonNegative = 0.0  # [m/s] each axis +-; 0 for no pushes
+    interval: tuple[Positive, Positive] = (4.0, 6.0)  # [s]
+    quiet_end: NonNegative = 2.0  # [s] at the end of an episode without a push
+
+
+class Noise(_Table, frozen=True):
+    """Half-widths of the uniform noise on what a controller observes."""
+
+    base_ang_vel: NonNegative = 0.0  # [rad/s]
+    gravity: NonNegative = 0.0  # of the unit vector
+    joint_pos: NonNegative = 0.0  # [rad]
+    joint_vel: NonNegative = 0.0  # [rad/s]
+    joint_torque: NonNegative = 0.0  # [N m]
+    ee_pos: NonNegative = 0.0  # [m]
+    ee_rot: NonNegative = 0.0  # of the entries of the rotation's first two columns
+
+
+class Termination(_Table, frozen=True):
+    """An episode ends, failed, when any of these is passed. Deterministic."""
+
+    tilt: Positive = 1.2566370614359172  # [rad] 0.4 pi between the base's and the world's vertical
+    base_height: NonNegative = 0.30  # [m]
+    illegal_contact: bool = True  # base, shank or arm on the ground
+
+
+class Success(_Table, frozen=True):
+    """Both errors stay inside the tolerances at every step of the final window. Source: paper, section IV-B."""
+
+    position: Positive = 0.05  # [m]
+    orientation: Positive = 0.12217304763960307  # [rad] 7 degrees
+    window: Positive = 1.0  # [s]
+
+
+class EvalProtocol(_Table, frozen=True):
+    """A whole protocol."""
+
+    name: str
+    description: str
+    episodes: Episodes
+    targets: WorkspaceTargets | ReachTargets
+    physics: Physics = Physics()
+    randomization: Randomization = Randomization()
+    push: Push = Push()
+    noise: Noise = Noise()
+    termination: Termination = Termination()
+    success: Success = Success()
+    reference_decay: Positive = 1.0  # [1/s] v_ref of the task-progress reference
+    robot: RobotConfig = RobotConfig()
+
+    @property
+    def control_period(self) -> float:
+        """[s]"""
+        return self.physics.timestep * self.physics.decimation
+
+    @property
+    def num_steps(self) -> int:
+        """Control steps of a whole episode."""
+        return round(self.episodes.horizon / self.control_period)
+
+    @property
+    def window_steps(self) -> int:
+        """Control steps of the success window."""
+        return round(self.success.window / self.control_period)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the canonical JSON of every field but the description."""
+        fields = msgspec.to_builtins(self)
+        del fields["description"]
+        return hashlib.sha256(msgspec.json.encode(fields, order="deterministic")).hexdigest()
+
+
+def load_protocol(path: Path) -> EvalProtocol:
+    """The protocol of a TOML file.
+
+    Raises:
+        ProtocolError: unreadable, an unknown key, a wrong type or an impossible range; names the field.
+    """
+    try:
+        protocol = msgspec.toml.decode(path.read_bytes(), type=EvalProtocol)
+    except FileNotFoundError as error:
+        raise ProtocolError(f"protocol file '{path}' does not exist") from error
+    except (OSError, msgspec.DecodeError) as error:
+        raise ProtocolError(f"protocol {path}: {error}") from error
+    _check(protocol, path)
+    return protocol
+
+
+def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
+    """A protocol by the name of a released one or by the path of a file, and where it stands.
+
+    Raises:
+        UnknownNameError: no such released protocol (with the nearest names).
+        ProtocolError: see `load_protocol`.
+    """
+    if name.endswith(".toml"):
+        path = Path(name)
+    else:
+        path = PROTOCOL_DIR / f"{name}.toml"
+        if not path.exists():
+            raise UnknownNameError("protocol", name, protocol_names(), "--protocol")
+    return load_protocol(path), path
+
+
+def protocol_names() -> list[str]:
+    """Names of the released protocols."""
+    return sorted(path.stem for path in PROTOCOL_DIR.glob("*.toml"))
+
+
+def _check(protocol: EvalProtocol, path: Path) -> None:
+    """What a type cannot say: ranges in order, windows inside episodes, whole control steps."""
+
+    def walk(value: object, where: str) -> None:
+        if isinstance(value, msgspec.Struct):
+            for field in value.__struct_fields__:
+                walk(getattr(value, field), f"{where}.{field}")
+        elif isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, float) for v in value):
+            if value[0] > value[1]:
+                raise ProtocolError(
+                    f"protocol {path}: low {value[0]:g} is above high {value[1]:g} - at `{where}`"
+                )
+
+    for field in protocol.__struct_fields__:
+        if field != "robot":  # gains are pairs, not ranges
+            walk(getattr(protocol, field), f"$.{field}")
+    horizon, success = protocol.episodes.horizon, protocol.success
+    if success.window > horizon:
+        raise ProtocolError(
+            f"protocol {path}: window {success.window:g} s is longer than the horizon of {horizon:g} s "
+            "- at `$.success.window`"
+        )
+    if protocol.randomization.friction[0] <= 0:
+        raise ProtocolError(f"protocol {path}: friction must be positive - at `$.randomization.friction`")
+    targets = protocol.targets
+    if isinstance(targets, ReachTargets):
+        low, high, _ = targets.heights
+        if not 0 <= low <= high:
+            raise ProtocolError(
+                f"protocol {path}: heights {low:g} to {high:g} m, valid: 0 <= low <= high - at `$.targets.heights`"
+            )
+        if not targets.orientations or not targets.conditions:
+            raise ProtocolError(f"protocol {path}: orientations and conditions need at least one - at `$.targets`")

@@ -1,0 +1,116 @@
+"""A shard of episodes on MuJoCo's batch API: reset from manifest rows, push, step, and measure."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+
+from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.protocol import EvalProtocol
+from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+from wbc_bench.rotations import matrix_from_wxyz
+
+Array = NDArray[np.float64]
+_STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
+MAX_SPEED = 1e3  # [m/s, rad/s] of any coordinate; beyond it the integration has diverged
+
+
+class State(NamedTuple):
+    """The true state of N simulations after a control step."""
+
+    base_pos_w: Array  # (N, 3) [m]
+    base_rot_w: Array  # (N, 3, 3)
+    base_lin_vel_w: Array  # (N, 3) [m/s]
+    base_ang_vel_b: Array  # (N, 3) [rad/s]
+    joint_pos: Array  # (N, 14) [rad]
+    joint_vel: Array  # (N, 14) [rad/s]
+    joint_torque: Array  # (N, 14) [N m]
+    ee_pos_w: Array  # (N, 3) [m]
+    ee_rot_w: Array  # (N, 3, 3)
+    foot_force_w: Array  # (N, 2, 3) [N] ground on left and right sole, one physics step late
+    ground_contact: NDArray[np.bool_]  # (N,) a part other than a foot touches the ground, one physics step late
+    diverged: NDArray[np.bool_]  # (N,)
+
+
+class Simulation:
+    """N episodes of one protocol, on one thread. Rows that have ended are not stepped further."""
+
+    def __init__(self, protocol: EvalProtocol, rows: EpisodeManifest) -> None:
+        self.protocol, self.rows = protocol, rows
+        self.robot = load_robot(protocol.robot)
+        model = self.robot.model(protocol.physics.timestep)
+        count = len(rows)
+        # persistent: sensors refreshed after a step are not computed again by the next
+        self._batch = batch = Batch(model, count, nthread=1, persistent=True)
+        self._randomise(model)
+        self._qpos, self._qvel, self._ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
+        self._torque, self._sensor = batch.bind("actuator_force"), batch.bind("sensordata")
+        self._tcp = model.site("tcp").id
+        names = [model.sensor(i).name for i in range(model.nsensor)]
+        address = {name: model.sensor_adr[i] for i, name in enumerate(names)}
+        self._ground = np.array([address[name] for name in names if name.startswith("ground_")])
+        self._soles = np.add.outer([address["sole_L_force"], address["sole_R_force"]], np.arange(3))
+        self._reset()
+
+    def _randomise(self, model: mujoco.MjModel) -> None:
+        """Friction, base mass and gains of each episode become model fields of its simulation."""
+        rows, batch = self.rows, self._batch
+        # the larger coefficient of a pair counts, so both sides carry the draw
+        batch.expand("geom_friction")[:, :, 0] = rows.friction[:, None]
+        base = model.body(self.robot.facts.base).id
+        mass = model.body_mass[base]
+        batch.expand("body_mass")[:, base] = mass + rows.base_mass
+        batch.expand("body_inertia")[:, base] = (
+            model.body_inertia[base] * ((mass + rows.base_mass) / mass)[:, None]
+        )
+        batch.expand("actuator_gainprm")[:, :, 0] *= rows.kp_scale
+        bias = batch.expand("actuator_biasprm")
+        bias[:, :, 1] *= rows.kp_scale
+        bias[:, :, 2] *= rows.kd_scale
+        batch.set_const()
+
+    def _reset(self) -> None:
+        rows, qpos, qvel = self.rows, self._qpos, self._qvel
+        self._batch.reset(stage=_STAGE_NONE)
+        qpos[:, :7] = 0.0
+        qpos[:, 2], qpos[:, 3] = rows.base_height, 1.0
+        qpos[:, 7:] = self.robot.default_q
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += rows.leg_q
+        qvel[:, :6] = rows.base_vel
+        qvel[:, 6 : 6 + NUM_LEG_JOINTS] = rows.leg_qd
+        self._ctrl[:] = self.robot.default_q
+        self._batch.forward()
+
+    def push(self, velocity_w: Array) -> None:
+        """Add (N, 2) [m/s] to the base's horizontal velocity in the world."""
+        self._qvel[:, :2] += velocity_w
+
+    def step(self, command: Array, active: NDArray[np.bool_]) -> None:
+        """Let the PD loop track joint commands (N, 14) [rad] for one control period, in active rows only."""
+        ids = np.flatnonzero(active)
+        self._ctrl[ids] = command[ids]
+        self._batch.step(
+            None if len(ids) == len(active) else ids, nstep=self.protocol.physics.decimation, stage=_STAGE_VEL
+        )
+
+    def state(self) -> State:
+        """The state now; arrays are copies or freshly computed."""
+        qpos, qvel = self._qpos.copy(), self._qvel.copy()
+        speed = np.abs(qvel).max(axis=1)
+        return State(
+            base_pos_w=qpos[:, :3],
+            base_rot_w=matrix_from_wxyz(qpos[:, 3:7]),
+            base_lin_vel_w=qvel[:, :3],
+            base_ang_vel_b=qvel[:, 3:6],
+            joint_pos=qpos[:, 7:],
+            joint_vel=qvel[:, 6:],
+            joint_torque=self._torque.copy(),
+            ee_pos_w=self._site_xpos[:, self._tcp].copy(),
+            ee_rot_w=self._site_xmat[:, self._tcp].reshape(-1, 3, 3).copy(),
+            foot_force_w=self._sensor[:, self._soles],
+            ground_contact=(self._sensor[:, self._ground] > 0).any(axis=1),
+            diverged=~(np.isfinite(qpos).all(axis=1) & (speed < MAX_SPEED)),
+        )
