@@ -67,31 +67,27 @@ class GravityFilter:
 class ComFilter:
     """Horizontal position and velocity of the centre of mass of one robot.
 
-    Between steps the mass follows the planned contact force; a jump of velocity (a push) is recognised by an
-    innovation that the noise cannot explain.
+    Between steps the mass follows the planned contact force; an innovation that the noise cannot explain is
+    taken for a push and opens the filter to a jump of the velocity.
     """
 
-    def __init__(self, period: float, pos_noise: float, acceleration: float) -> None:
+    def __init__(self, period: float, pos_noise: float, acceleration: float, jump: float, pos: Array) -> None:
         self._a = np.array([[1.0, period], [0.0, 1.0]])
         self._b = np.array([period**2 / 2, period])
         self._process = acceleration**2 * np.outer(self._b, self._b)
         self._measurement = pos_noise**2
-        self._jump = np.diag([0.0, 0.3**2])  # [m^2/s^2] variance a push adds to the velocity
-
-    def reset(self, pos: Array) -> None:
-        """Start at a measured position (2,) [m] with a velocity known to 0.3 m/s."""
+        self._jump = jump**2 * np.outer([period, 1.0], [period, 1.0])
         self.pos, self.vel = pos.copy(), np.zeros(2)
-        self._cov = np.diag([self._measurement, 0.2**2])
+        self._cov = np.diag([self._measurement, jump**2])
 
     def update(self, pos: Array, acceleration: Array) -> None:
         """Take in a measured position (2,) [m] after a step with a planned acceleration (2,) [m/s^2]."""
-        a, period = self._a, self._a[0, 1]
-        pred = self.pos + period * self.vel + self._b[0] * acceleration
+        pred = self._a[0, 0] * self.pos + self._a[0, 1] * self.vel + self._b[0] * acceleration
         vel = self.vel + self._b[1] * acceleration
-        cov = a @ self._cov @ a.T + self._process
+        cov = self._a @ self._cov @ self._a.T + self._process
         innovation = pos - pred
-        if innovation @ innovation > 2 * 9.0 * (cov[0, 0] + self._measurement):
-            cov = cov + a @ self._jump @ a.T
+        if innovation @ innovation > 9.0 * 2 * (cov[0, 0] + self._measurement):  # three sigma
+            cov = cov + self._jump
         gain = cov[:, 0] / (cov[0, 0] + self._measurement)
         self.pos, self.vel = pred + gain[0] * innovation, vel + gain[1] * innovation
         self._cov = cov - np.outer(gain, cov[0])

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from wbc_bench.robot import JOINT_NAMES, Robot
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]  # position (3,) [m], rotation (3, 3)
 GRAVITY = 9.81  # [m/s^2]
-SIDES = ("L", "R")
 
 
 class WholeBodyModel:
@@ -17,28 +17,57 @@ class WholeBodyModel:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self.robot = robot
         self.model = pin.buildModelFromXML(robot.urdf(), pin.JointModelFreeFlyer())
         assert tuple(self.model.names)[2:] == JOINT_NAMES
         self.model.armature[6:] = robot.armature  # URDF has no field for it
         self.data = self.model.createData()
         self.tcp = self.model.getFrameId("tcp")
-        self.soles = [self.model.getFrameId(f"sole_{side}") for side in SIDES]
+        self.soles = [self.model.getFrameId(f"sole_{side}") for side in "LR"]
         self.mass = pin.computeTotalMass(self.model)
         foot = robot.facts.foot
-        self.corners = np.array([(x, y, 0.0) for x in foot.x for y in foot.y])  # in the sole frame [m]
+        self.corners = np.array([(x, y, 0.0) for x in foot.x for y in foot.y])  # (4, 3) in the sole frame [m]
+        self._q = pin.neutral(self.model)
+
+    def soles_in_base(self, joints: Array) -> list[Pose]:
+        """Sole poses in the base frame at joint positions (14,) [rad]."""
+        self._q[7:] = joints
+        pin.framesForwardKinematics(self.model, self.data, self._q)
+        return [self.pose(sole) for sole in self.soles]
 
     def update(self, q: Array) -> None:
         """Kinematics, Jacobians and centre of mass at q."""
         pin.computeJointJacobians(self.model, self.data, q)
         pin.updateFramePlacements(self.model, self.data)
-        pin.jacobianCenterOfMass(self.model, self.data, False)
+        pin.centerOfMass(self.model, self.data, False)
 
-    def pose(self, frame: int) -> tuple[Array, Array]:
-        """Position (3,) and rotation (3, 3) of a frame after `update`; copies."""
+    def com_of(self, q: Array) -> Array:
+        """Centre of mass (3,) [m] at q."""
+        return pin.centerOfMass(self.model, self.data, q).copy()
+
+    def ee_of(self, q: Array) -> Pose:
+        """End-effector pose at q."""
+        pin.framesForwardKinematics(self.model, self.data, q)
+        return self.pose(self.tcp)
+
+    def gravity_torques(self, q: Array) -> Array:
+        """Generalised gravity forces (20,) at q, base rows world-aligned like the Jacobians' columns."""
+        return pin.computeGeneralizedGravity(self.model, self.data, q)
+
+    def pose(self, frame: int) -> Pose:
+        """Pose of a frame after an update; copies."""
         placement = self.data.oMf[frame]
         return placement.translation.copy(), placement.rotation.copy()
 
     def jacobian(self, frame: int) -> Array:
         """Jacobian (6, 20), linear over angular, world-aligned, after `update`."""
         return pin.getFrameJacobian(self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED)
+
+
+def configuration(pos: Array, rot: Array, joints: Array) -> Array:
+    """Pinocchio's q (21,) of a base pose and joint positions (14,)."""
+    return np.concatenate([pos, pin.Quaternion(rot).coeffs(), joints])
+
+
+def turn(rot: Array, target: Array, fraction: float) -> Array:
+    """The rotation a fraction of the way from one (3, 3) to another along the geodesic."""
+    return rot @ pin.exp3(fraction * pin.log3(rot.T @ target))
