@@ -135,7 +135,9 @@ def load_controller(spec: str, robot: Robot) -> Controller:
         raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
     info = getattr(controller, "info", None)
     if not isinstance(info, ControllerInfo):
-        raise ControllerError(f"controller '{spec}' has no `info`, valid: a wbc_bench.controller.ControllerInfo")
+        raise ControllerError(
+            f"controller '{spec}' has no `info`, valid: a wbc_bench.controller.ControllerInfo"
+        )
     for signal in sorted(info.signals):
         if signal not in SIGNALS:
             raise UnknownNameError("signal", signal, SIGNALS, f"declared by controller '{spec}'")
@@ -148,22 +150,28 @@ def slug(spec: str) -> str:
 
 
 def _load_attribute(module: str, attribute: str):
-    if module.endswith(".py"):
-        path = Path(module).resolve()
+    path = Path(module).resolve() if module.endswith(".py") else None
+    if path is None:
+        folder = str(Path.cwd())
+    else:
         if not path.exists():
             raise ControllerError(f"controller file '{module}' does not exist")
         folder, module = str(path.parent), path.stem
-    else:
-        folder = str(Path.cwd())
     if folder not in sys.path:
         sys.path.insert(0, folder)
     try:
-        return getattr(importlib.import_module(module), attribute)
+        found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0]:
             raise
         raise UnknownNameError(
             "controller", module, controllers(), "--controller; no such module either"
         ) from error
-    except AttributeError as error:
-        raise ControllerError(f"controller '{module}:{attribute}': module has no '{attribute}'") from error
+    if path is not None and Path(found.__file__ or "").resolve() != path:
+        raise ControllerError(
+            f"controller file '{path}': the name '{module}' belongs to {found.__file__ or 'Python'}, "
+            "give the file another"
+        )
+    if not hasattr(found, attribute):
+        raise ControllerError(f"controller '{module}:{attribute}': module has no '{attribute}'")
+    return getattr(found, attribute)

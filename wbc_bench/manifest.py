@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from wbc_bench.errors import ManifestError
 from wbc_bench.protocol import EvalProtocol
 
-MAX_PUSHES = 2
-
 
 @dataclass(frozen=True)
 class EpisodeManifest:
@@ -27,7 +25,9 @@ class EpisodeManifest:
     height: NDArray[np.float64]  # (M,) [m] nominal target height (reach), else the target's
     target_pos_w: NDArray[np.float64]  # (M, 3) [m]
     target_quat_w: NDArray[np.float64]  # (M, 4) wxyz
-    witness_qpos: NDArray[np.float64]  # (M, 21) a feasible configuration that reaches the target; NaN if beyond
+    witness_qpos: NDArray[
+        np.float64
+    ]  # (M, 21) a feasible configuration that reaches the target; NaN if beyond
     base_height: NDArray[np.float64]  # (M,) [m] at reset: the lower sole touches the ground
     friction: NDArray[np.float64]  # (M,)
     base_mass: NDArray[np.float64]  # (M,) [kg] added
@@ -71,7 +71,7 @@ def write_manifest(manifest: EpisodeManifest, protocol: EvalProtocol, path: Path
         names.append(field.name)
     table = pa.Table.from_arrays(arrays, names=names)
     table = table.replace_schema_metadata({"protocol": protocol.name, "protocol_digest": protocol.digest})
-    pq.write_table(table, path, compression="zstd", use_dictionary=["stratum", "condition", "orientation"])
+    pq.write_table(table, path, compression="zstd", use_dictionary=False)
 
 
 def read_manifest(protocol: EvalProtocol, path: Path) -> tuple[EpisodeManifest, str]:
@@ -90,7 +90,8 @@ def read_manifest(protocol: EvalProtocol, path: Path) -> tuple[EpisodeManifest, 
     recorded = recorded_file.read_text().split()[0] if recorded_file.exists() else "none recorded"
     if recorded != sha256:
         raise ManifestError(
-            f"manifest '{path}' does not match its hash: {sha256[:16]}..., {recorded_file.name} says {recorded[:16]}..."
+            f"manifest '{path}' does not match its hash: it has {sha256[:16]}..., "
+            f"{recorded_file.name} says {recorded[:16]}..."
         )
     try:
         table = pq.read_table(pa.BufferReader(data))

@@ -5,19 +5,21 @@ Its digest covers the meaning of the file, not its layout or comments.
 """
 
 import hashlib
+import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
-from wbc_bench.robot import RobotConfig
+from wbc_bench.robot import RobotConfig, load_facts
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Range = tuple[float, float]  # (low, high)
 
+MAX_PUSHES = 2  # columns of a manifest; `load_protocol` refuses a schedule with room for more
 PROTOCOL_DIR = Path(__file__).with_name("protocols")
 
 
@@ -69,6 +71,12 @@ class ReachTargets(_Table, frozen=True, tag="reach"):
     conditions: tuple[Literal["nominal", "randomised"], ...]
     com_margin: NonNegative = 0.02  # [m]
 
+    @property
+    def num_heights(self) -> int:
+        """Rungs of the ladder, both ends included where the spacing allows."""
+        low, high, spacing = self.heights
+        return math.floor((high - low) / spacing + 1e-9) + 1
+
 
 class Randomization(_Table, frozen=True):
     """Ranges of the uniform draws of an episode. Source: the paper names the quantities, not the ranges."""
@@ -111,7 +119,7 @@ class Termination(_Table, frozen=True):
 
 
 class Success(_Table, frozen=True):
-    """Both errors stay inside the tolerances at every step of the final window. Source: paper, section IV-B."""
+    """Both errors stay inside the tolerances throughout the final window. Source: paper, section IV-B."""
 
     position: Positive = 0.05  # [m]
     orientation: Positive = 0.12217304763960307  # [rad] 7 degrees
@@ -195,35 +203,71 @@ def protocol_names() -> list[str]:
 
 
 def _check(protocol: EvalProtocol, path: Path) -> None:
-    """What a type cannot say: ranges in order, windows inside episodes, whole control steps."""
+    """What a type cannot say: finite numbers, ranges in order, windows inside episodes."""
+
+    def refuse(problem: str, where: str) -> NoReturn:
+        raise ProtocolError(f"protocol {path}: {problem} - at `$.{where}`")
 
     def walk(value: object, where: str) -> None:
         if isinstance(value, msgspec.Struct):
             for field in value.__struct_fields__:
                 walk(getattr(value, field), f"{where}.{field}")
-        elif isinstance(value, tuple) and len(value) == 2 and all(isinstance(v, float) for v in value):
-            if value[0] > value[1]:
-                raise ProtocolError(
-                    f"protocol {path}: low {value[0]:g} is above high {value[1]:g} - at `{where}`"
-                )
+        elif isinstance(value, float) and not math.isfinite(value):
+            refuse(f"{value} is not a finite number", where)
+        elif isinstance(value, tuple):
+            for item in value:
+                walk(item, where)
+            pair = len(value) == 2 and all(isinstance(item, float) for item in value)
+            if pair and not where.startswith("robot") and value[0] > value[1]:  # gains are pairs, not ranges
+                refuse(f"low {value[0]:g} is above high {value[1]:g}", where)
 
     for field in protocol.__struct_fields__:
-        if field != "robot":  # gains are pairs, not ranges
-            walk(getattr(protocol, field), f"$.{field}")
-    horizon, success = protocol.episodes.horizon, protocol.success
-    if success.window > horizon:
-        raise ProtocolError(
-            f"protocol {path}: window {success.window:g} s is longer than the horizon of {horizon:g} s "
-            "- at `$.success.window`"
+        walk(getattr(protocol, field), field)
+
+    horizon, period = protocol.episodes.horizon, protocol.control_period
+    for name, seconds in (("episodes.horizon", horizon), ("success.window", protocol.success.window)):
+        if abs(seconds / period - round(seconds / period)) > 1e-6 or seconds < period / 2:
+            refuse(f"{seconds:g} s is not a whole number of control periods of {period:g} s", name)
+    if protocol.success.window > horizon:
+        refuse(f"{protocol.success.window:g} s is longer than the horizon of {horizon:g} s", "success.window")
+    if protocol.episodes.seed >= 2**63:
+        refuse(f"seed {protocol.episodes.seed} is too large, valid: below 2^63", "episodes.seed")
+
+    spread, push, targets = protocol.randomization, protocol.push, protocol.targets
+    for name in ("friction", "gain"):
+        if getattr(spread, name)[0] <= 0:
+            refuse(f"low {getattr(spread, name)[0]:g} must be positive", f"randomization.{name}")
+    lightest = -next(link.mass for link in load_facts().links if link.name == load_facts().base)
+    if spread.base_mass[0] <= lightest:
+        refuse(
+            f"low {spread.base_mass[0]:g} kg leaves no base, valid: above {lightest:g} kg",
+            "randomization.base_mass",
         )
-    if protocol.randomization.friction[0] <= 0:
-        raise ProtocolError(f"protocol {path}: friction must be positive - at `$.randomization.friction`")
-    targets = protocol.targets
-    if isinstance(targets, ReachTargets):
+    if push.speed > 0 and (MAX_PUSHES + 1) * push.interval[0] < horizon - push.quiet_end - 1e-9:
+        refuse(
+            f"{push.interval[0]:g} s leaves room for more than {MAX_PUSHES} pushes an episode",
+            "push.interval",
+        )
+
+    if isinstance(targets, WorkspaceTargets):
+        if targets.height[0] < 0:
+            refuse(f"low {targets.height[0]:g} m is below the ground", "targets.height")
+        if targets.step_distance[0] < 0:
+            refuse(f"low {targets.step_distance[0]:g} m must not be negative", "targets.step_distance")
+        if not targets.weights:
+            refuse("no stratum has a weight, valid: arm, posture, step", "targets.weights")
+    else:
         low, high, _ = targets.heights
         if not 0 <= low <= high:
-            raise ProtocolError(
-                f"protocol {path}: heights {low:g} to {high:g} m, valid: 0 <= low <= high - at `$.targets.heights`"
+            refuse(f"heights {low:g} to {high:g} m, valid: 0 <= low <= high", "targets.heights")
+        for name in ("orientations", "conditions"):
+            names = getattr(targets, name)
+            if not names or len(set(names)) < len(names):
+                refuse(f"{list(names)} must name at least one, each once", f"targets.{name}")
+        count = len(targets.orientations) * len(targets.conditions) * targets.per_height * targets.num_heights
+        if (protocol.episodes.replicates, protocol.episodes.per_replicate) != (1, count):
+            refuse(
+                f"{protocol.episodes.replicates} x {protocol.episodes.per_replicate} episodes, "
+                f"the ladder has 1 x {count}",
+                "episodes.per_replicate",
             )
-        if not targets.orientations or not targets.conditions:
-            raise ProtocolError(f"protocol {path}: orientations and conditions need at least one - at `$.targets`")

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 def matrix_from_wxyz(quat: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), scalar first. Source: Diebel 2006, eq. 125."""
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4), scalar first. Source: Diebel 2006."""
     w, x, y, z = np.moveaxis(quat, -1, 0)
     rot = np.empty((*quat.shape[:-1], 3, 3))
     rot[..., 0, 0] = 1 - 2 * (y * y + z * z)
@@ -74,9 +74,7 @@ def matrix_from_rotvec(rotvec: Array) -> Array:
     hat[..., 0, 1], hat[..., 0, 2], hat[..., 1, 2] = -rotvec[..., 2], rotvec[..., 1], -rotvec[..., 0]
     hat -= np.swapaxes(hat, -1, -2)
     # sinc keeps both coefficients exact at angle zero
-    return (
-        np.eye(3) + np.sinc(angle / np.pi) * hat + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (hat @ hat)
-    )
+    return np.eye(3) + np.sinc(angle / np.pi) * hat + 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 * (hat @ hat)
 
 
 def rotvec_from_matrix(rot: Array) -> Array:
@@ -89,7 +87,7 @@ def rotvec_from_matrix(rot: Array) -> Array:
 
 
 def geodesic_angle(a: Array, b: Array) -> Array:
-    """Angle (...,) [rad] of the rotation between matrices (..., 3, 3), accurate near 0 and pi.
+    """Angle (...,) [rad] of the rotation between matrices (..., 3, 3), exact near 0, to 1e-7 near pi.
 
     Source: paper, "geodesic distance between rotation matrices"; ||a - b||_F = 2 sqrt(2) sin(angle / 2).
     """

@@ -15,6 +15,8 @@ from wbc_bench.rotations import matrix_from_wxyz
 Array = NDArray[np.float64]
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
 MAX_SPEED = 1e3  # [m/s, rad/s] of any coordinate; beyond it the integration has diverged
+# on these MuJoCo resets the simulation or zeroes its controls, and goes on as if nothing had happened
+_FATAL = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC", "CTRL")]
 
 
 class State(NamedTuple):
@@ -30,7 +32,9 @@ class State(NamedTuple):
     ee_pos_w: Array  # (N, 3) [m]
     ee_rot_w: Array  # (N, 3, 3)
     foot_force_w: Array  # (N, 2, 3) [N] ground on left and right sole, one physics step late
-    ground_contact: NDArray[np.bool_]  # (N,) a part other than a foot touches the ground, one physics step late
+    ground_contact: NDArray[
+        np.bool_
+    ]  # (N,) a part other than a foot touches the ground, one physics step late
     diverged: NDArray[np.bool_]  # (N,)
 
 
@@ -100,6 +104,7 @@ class Simulation:
         """The state now; arrays are copies or freshly computed."""
         qpos, qvel = self._qpos.copy(), self._qvel.copy()
         speed = np.abs(qvel).max(axis=1)
+        fatal = np.any(self._batch.warning[:, _FATAL, 1] > 0, axis=1)
         return State(
             base_pos_w=qpos[:, :3],
             base_rot_w=matrix_from_wxyz(qpos[:, 3:7]),
@@ -111,6 +116,6 @@ class Simulation:
             ee_pos_w=self._site_xpos[:, self._tcp].copy(),
             ee_rot_w=self._site_xmat[:, self._tcp].reshape(-1, 3, 3).copy(),
             foot_force_w=self._sensor[:, self._soles],
-            ground_contact=(self._sensor[:, self._ground] > 0).any(axis=1),
-            diverged=~(np.isfinite(qpos).all(axis=1) & (speed < MAX_SPEED)),
+            ground_contact=np.any(self._sensor[:, self._ground] > 0, axis=1),
+            diverged=~(np.isfinite(qpos).all(axis=1) & (speed < MAX_SPEED)) | fatal,
         )

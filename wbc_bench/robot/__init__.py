@@ -34,7 +34,7 @@ NUM_LEG_JOINTS = sum(name.endswith("_Joint") for name in JOINT_NAMES)
 
 @dataclass(frozen=True)
 class Robot:
-    """A configured robot: the joint-space constants that controllers and metrics share, and its two models."""
+    """A configured robot: the joint-space constants that all share, and its two models."""
 
     facts: Facts
     config: RobotConfig
@@ -73,7 +73,8 @@ def load_robot(config: RobotConfig = RobotConfig()) -> Robot:  # noqa: B008  (fr
         UnknownNameError: a mount or end-effector that the facts do not have.
     """
     facts = load_facts()
-    mount_of(facts, config), tcp_of(facts, config)
+    mount_of(facts, config)
+    tcp_of(facts, config)
     joints = facts.joints
     gains = np.array([gain_of(facts, joint, config) for joint in joints])
     scale = facts.action_scale

@@ -12,7 +12,14 @@ _TYPES = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
-_COLOURS = {"arm": (0.85, 0.55, 0.25, 1), "grip": (0.25, 0.25, 0.28, 1), "base": (0.75, 0.77, 0.8, 1)}
+_COLOURS = {  # by the first word of a geom's name; legs take the last
+    "base": (0.80, 0.82, 0.85, 1),
+    "arm": (0.90, 0.56, 0.20, 1),
+    "grip": (0.30, 0.33, 0.40, 1),
+    "tron1computer": (0.45, 0.55, 0.62, 1),
+    "foot": (0.22, 0.24, 0.28, 1),
+    "": (0.36, 0.46, 0.60, 1),
+}
 
 
 def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mujoco.MjSpec:
@@ -31,8 +38,8 @@ def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mu
     # the sparse Newton Hessian of MuJoCo 4.0.0 is wrong; this model is small enough for dense anyway
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
-
     world = spec.worldbody
+    _add_surroundings(spec)
     world.add_geom(
         name="ground",
         type=mujoco.mjtGeom.mjGEOM_PLANE,
@@ -40,7 +47,7 @@ def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mu
         contype=GROUND,
         conaffinity=GROUND,
         friction=[facts.friction.slide, 0.005, 0.0001],
-        rgba=[0.93, 0.93, 0.91, 1],
+        material="ground",
     )
     links = {link.name: link for link in facts.links}
     base = _add_link(world, links[facts.base], (0.0, 0.0, facts.nominal_base_height))
@@ -96,6 +103,42 @@ def build_model(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> m
     return build_spec(facts, config, timestep).compile()
 
 
+def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    """What only a picture needs: light, a pale sky, and a ground grid of 0.5 m."""
+    spec.visual.headlight.ambient = (0.42, 0.42, 0.42)
+    spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
+    spec.visual.headlight.specular = (0.05, 0.05, 0.05)
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=[1, 2, 4],
+        dir=[-0.55, -0.25, -0.8],
+        diffuse=[0.45, 0.45, 0.45],
+        specular=[0.1, 0.1, 0.1],
+    )
+    builtin, kind = mujoco.mjtBuiltin, mujoco.mjtTexture
+    spec.add_texture(
+        name="sky",
+        type=kind.mjTEXTURE_SKYBOX,
+        builtin=builtin.mjBUILTIN_GRADIENT,
+        rgb1=[1, 1, 1],
+        rgb2=[0.85, 0.89, 0.94],
+        width=32,
+        height=192,
+    )
+    spec.add_texture(
+        name="ground",
+        type=kind.mjTEXTURE_2D,
+        builtin=builtin.mjBUILTIN_FLAT,
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        rgb1=[0.93, 0.93, 0.92],
+        markrgb=[0.72, 0.74, 0.77],
+        width=128,
+        height=128,
+    )
+    material = spec.add_material(name="ground", texrepeat=[2, 2], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
+
+
 def _add_link(parent, link: Link, xyz: tuple[float, float, float]):
     body = parent.add_body(name=link.name, pos=xyz)
     body.mass, body.ipos, body.fullinertia = link.mass, link.com, link.inertia
@@ -119,7 +162,7 @@ def _add_geom(body, geom: Geom) -> None:
         contype=GROUND | BODY,
         conaffinity=GROUND | BODY,
         mass=0,
-        rgba=_COLOURS.get(geom.name.split("_")[0], (0.35, 0.38, 0.42, 1)),
+        rgba=_COLOURS.get(geom.name.split("_")[0], _COLOURS[""]),
     )
     # URDF's fixed-axis roll, pitch, yaw
     quat = np.zeros(4)
@@ -139,7 +182,7 @@ def _add_foot(body, facts: Facts, side: str) -> None:
             contype=GROUND,
             conaffinity=GROUND,
             mass=0,
-            rgba=(0.2, 0.2, 0.22, 1),
+            rgba=_COLOURS["foot"],
         )
     height = 0.03  # [m] of the shoe above the sole
     body.add_geom(
@@ -150,7 +193,7 @@ def _add_foot(body, facts: Facts, side: str) -> None:
         contype=BODY,
         conaffinity=BODY,
         mass=0,
-        rgba=(0.2, 0.2, 0.22, 1),
+        rgba=_COLOURS["foot"],
     )
 
 
@@ -176,7 +219,10 @@ def _add_sensors(spec: mujoco.MjSpec) -> None:
     contact, body, geom = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtObj.mjOBJ_BODY, mujoco.mjtObj.mjOBJ_GEOM
     found, force, net = 0, 1, 3  # mjtConDataField and reduction codes
     for link in spec.bodies:
-        if any(g.contype & GROUND and not g.name.startswith("foot") for g in link.geoms) and link.name != "world":
+        if (
+            any(g.contype & GROUND and not g.name.startswith("foot") for g in link.geoms)
+            and link.name != "world"
+        ):
             spec.add_sensor(
                 name=f"ground_{link.name}",
                 type=contact,

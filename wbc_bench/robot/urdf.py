@@ -6,7 +6,7 @@ from wbc_bench.robot.facts import Facts, Frame, Geom, Link, RobotConfig, effort_
 
 
 def build_urdf(facts: Facts, config: RobotConfig) -> str:
-    """URDF text: links, joints, primitive collision shapes, and massless links `tcp`, `sole_L`, `sole_R`, `imu`.
+    """URDF text: links, joints, primitive collision shapes; massless links `tcp`, `sole_L`, `sole_R`, `imu`.
 
     URDF has no field for the reflected inertia of a motor: set `armature` on the model that reads it.
     """

@@ -26,12 +26,13 @@ class _Episode:
         self.ee = ee  # slewed target
         self.target = target  # filtered target
         self.com = com
-        self.acceleration = np.zeros(2)  # [m/s^2] planned for the centre of mass
+        self.acceleration = np.zeros(3)  # [m/s^2] planned for the centre of mass
         self.speed = 0.0  # of the slewing, as a fraction of its limit
         self.start = q[7:]  # (14,) joint positions before the way,
         self.goal: Array | None = None  # (14,) planned at its end,
         self.way, self.left = 0.0, 0.0  # [s] its length at full speed, and what is left of it
         self.correction_pos, self.correction_rot = np.zeros(3), np.zeros(3)  # integral of the hand's error
+        self.rot_integral = np.zeros(3)  # [rad/s^2]
         self.command = q[7:].copy()
         self.hull = np.zeros((3, 2))
 
@@ -64,9 +65,11 @@ class IKController:
         stance = measured_stance([(pos + rot @ p, rot @ r) for p, r in soles_b])
         q = configuration(pos, rot, joints)
         s = self._s
-        com = ComFilter(PERIOD, s.com_noise, s.com_acceleration, s.com_jump, model.com_of(q)[:2])
+        com = ComFilter(PERIOD, s.com_noise, s.com_acceleration, s.com_drift, s.com_jump, s.com_threshold, model.com_of(q))
         goal = (pos + rot @ target.pos_b[i], rot @ target.rot_b[i])
-        return _Episode(stance, q, model.ee_of(q), goal, com)
+        episode = _Episode(stance, q, model.ee_of(q), goal, com)
+        episode.row = i
+        return episode
 
     def act(self, obs: Observation, target: Target) -> JointCommand:
         """Joint commands (N, 14) [rad]; an episode without a solution holds its last command."""
@@ -81,7 +84,7 @@ class IKController:
             episode = self._episodes[i]
             found = self._step(
                 episode,
-                self._joints.pos[i],
+                p.joint_pos[i],
                 -self._gravity.gravity[i],
                 p.base_ang_vel_b[i],
                 (target.pos_b[i], target.rot_b[i]),
@@ -114,6 +117,7 @@ class IKController:
         if s.feedforward:
             torques = self._balance(e, measured, rot, ang_vel_b)
             e.command += np.clip(torques, -self._robot.effort, self._robot.effort) / self._robot.kp
+            e.command[:8] += s.compliance * (self._joints.pos[e.row] - q[7:])[:8]
         return True
 
     def _slew(self, e: _Episode, target: Pose, ee: Pose) -> None:
@@ -187,24 +191,26 @@ class IKController:
     def _balance(self, e: _Episode, measured: Array, rot: Array, ang_vel_b: Array) -> Array:
         """Torques (14,) [N m] that carry the weight and bring centre of mass and base to the reference."""
         s, model = self._s, self._model
-        com = model.data.com[0].copy()
-        e.com.update(com[:2], e.acceleration)
+        e.com.update(model.data.com[0], e.acceleration)
         soles = [model.pose(sole) for sole in model.soles]
         jacobians = [model.jacobian(sole) for sole in model.soles]
         torques = model.gravity_torques(measured)
         wrench = np.zeros(6)
         wrench[2] = model.mass * GRAVITY
         if s.feedback:
-            com_ref = model.com_of(e.q)[:2]
-            wrench[:2] = model.mass * (s.kp_com * (com_ref - e.com.pos) - s.kd_com * e.com.vel)
+            error = model.com_of(e.q) - e.com.pos
+            gains = np.array([1.0, 1.0, s.height_gain])
+            wrench[:3] += model.mass * gains * (s.kp_com * error - s.kd_com * e.com.vel)
+            wrench[:3] -= model.mass * s.rejection * e.com.disturbance
             rot_ref = pin.Quaternion(e.q[3:7]).toRotationMatrix()
             error = rot @ pin.log3(rot.T @ rot_ref)
-            wrench[3:] = s.inertia * (s.kp_rot * error - s.kd_rot * (rot @ ang_vel_b))
-        com[:2] = e.com.pos
+            limit = s.rot_integral_limit
+            e.rot_integral = np.clip(e.rot_integral + PERIOD * s.ki_rot * error, -limit, limit)
+            wrench[3:] = s.inertia * (s.kp_rot * error - s.kd_rot * (rot @ ang_vel_b) + e.rot_integral)
         arms = [self._contacts @ r.T for _, r in soles]
-        points = np.concatenate([p + arm for (p, _), arm in zip(soles, arms, strict=True)]) - com
+        points = np.concatenate([p + arm for (p, _), arm in zip(soles, arms, strict=True)]) - e.com.pos
         forces = distribute(points, self._rays, wrench, self._weight, s.damping)
-        e.acceleration = forces.sum(axis=0)[:2] / model.mass
+        e.acceleration = forces.sum(axis=0) / model.mass - np.array([0.0, 0.0, GRAVITY])
         for jacobian, arm, force in zip(jacobians, arms, np.split(forces, 2), strict=True):
             moment = np.array(
                 [

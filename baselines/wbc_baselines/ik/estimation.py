@@ -65,29 +65,51 @@ class GravityFilter:
 
 
 class ComFilter:
-    """Horizontal position and velocity of the centre of mass of one robot.
+    """Position, velocity and disturbance acceleration of the centre of mass of one robot, a Kalman filter.
 
-    Between steps the mass follows the planned contact force; an innovation that the noise cannot explain is
-    taken for a push and opens the filter to a jump of the velocity.
+    Between steps the mass follows the planned contact force plus a slowly varying disturbance (an unknown mass,
+    gains that are not the nominal ones). An innovation that the noise cannot explain is taken for a push and
+    opens the filter to a jump of the velocity.
     """
 
-    def __init__(self, period: float, pos_noise: float, acceleration: float, jump: float, pos: Array) -> None:
-        self._a = np.array([[1.0, period], [0.0, 1.0]])
-        self._b = np.array([period**2 / 2, period])
+    def __init__(
+        self, period: float, pos_noise: float, acceleration: float, drift: float, jump: float, threshold: float, pos: Array
+    ) -> None:
+        self._a = np.array([[1.0, period, period**2 / 2], [0.0, 1.0, period], [0.0, 0.0, 1.0]])
+        self._b = self._a[:, 2].copy()
+        self._b[2] = 0.0
         self._process = acceleration**2 * np.outer(self._b, self._b)
+        self._process[2, 2] = drift**2 * period
         self._measurement = pos_noise**2
-        self._jump = jump**2 * np.outer([period, 1.0], [period, 1.0])
-        self.pos, self.vel = pos.copy(), np.zeros(2)
-        self._cov = np.diag([self._measurement, jump**2])
+        direction = np.array([period, 1.0, 0.0])
+        self._jump = jump**2 * np.outer(direction, direction)
+        self.threshold = threshold
+        self._state = np.zeros((3, 3))
+        self._state[0] = pos
+        self._cov = np.diag([self._measurement, jump**2, drift**2])
+
+    @property
+    def pos(self) -> Array:
+        """(3,) [m]"""
+        return self._state[0]
+
+    @property
+    def vel(self) -> Array:
+        """(3,) [m/s]"""
+        return self._state[1]
+
+    @property
+    def disturbance(self) -> Array:
+        """(3,) [m/s^2]"""
+        return self._state[2]
 
     def update(self, pos: Array, acceleration: Array) -> None:
-        """Take in a measured position (2,) [m] after a step with a planned acceleration (2,) [m/s^2]."""
-        pred = self._a[0, 0] * self.pos + self._a[0, 1] * self.vel + self._b[0] * acceleration
-        vel = self.vel + self._b[1] * acceleration
+        """Take in a measured position (3,) [m] after a step with a planned acceleration (3,) [m/s^2]."""
+        state = self._a @ self._state + self._b[:, None] * acceleration
         cov = self._a @ self._cov @ self._a.T + self._process
-        innovation = pos - pred
-        if innovation @ innovation > 9.0 * 2 * (cov[0, 0] + self._measurement):  # three sigma
+        innovation = pos - state[0]
+        if innovation @ innovation > self.threshold**2 * 3 * (cov[0, 0] + self._measurement):  # three sigma
             cov = cov + self._jump
         gain = cov[:, 0] / (cov[0, 0] + self._measurement)
-        self.pos, self.vel = pred + gain[0] * innovation, vel + gain[1] * innovation
-        self._cov = cov - np.outer(gain, cov[0])
+        self._state = state + gain[:, None] * innovation
+        self._cov = cov - gain[:, None] * cov[0]

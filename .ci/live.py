@@ -1,0 +1,70 @@
+"""Evaluate 60 committed episodes of every controller and protocol again and compare them with the record.
+
+Another processor rounds differently, and a robot on the verge of falling amplifies that; so not the bytes are
+compared but, over episodes spread evenly over all replicates:
+  - at least 90 % of the outcomes are equal;
+  - where they are equal and the robot stood, the median change of the position error is below 5 mm.
+"""
+
+import os
+import sys
+
+import numpy as np
+import pandas as pd
+from joblib import Parallel, delayed
+
+from wbc_bench.analysis import collect, stood
+from wbc_bench.execution import evaluate_shard
+from wbc_bench.manifest import manifest_path, read_manifest
+from wbc_bench.protocol import find_protocol
+from wbc_bench.store import ResultStore
+
+EPISODES = 60
+EQUAL_OUTCOMES = 0.90
+POSITION_CHANGE = 0.005  # [m]
+
+
+def main() -> int:
+    store = ResultStore(sys.argv[1])
+    names = sorted({run.record.protocol for run in store.runs()})
+    if not names:
+        print(f"SKIPPED: no records under {store.root} yet")
+        return 0
+    labels, work, failures = [], [], 0
+    for name in names:
+        protocol, path = find_protocol(name)
+        manifest, sha256 = read_manifest(protocol, manifest_path(path))
+        row_of = {key: row for row, key in enumerate(zip(manifest.replicate, manifest.episode, strict=True))}
+        for spec, method in collect(store, name).items():
+            record = method.records[0]
+            if (record.protocol_digest, record.manifest_sha256) != (protocol.digest, sha256):
+                print(f"FAILED {name} {spec}: the records answer another protocol or manifest")
+                failures += 1
+                continue
+            every = np.linspace(0, len(method.episodes) - 1, min(EPISODES, len(method.episodes))).astype(int)
+            chosen = method.episodes.iloc[every].reset_index(drop=True)
+            keys = zip(chosen["replicate"], chosen["episode"], strict=True)
+            rows = manifest.take(np.array([row_of[key] for key in keys]))
+            labels.append((name, spec, chosen))
+            work.append(delayed(evaluate_shard)(spec, protocol, rows))
+    for (name, spec, before), table in zip(labels, Parallel(os.cpu_count())(work), strict=True):
+        failures += not compare(name, spec, before, table.to_pandas())
+    return 1 if failures else 0
+
+
+def compare(name: str, spec: str, before: pd.DataFrame, after: pd.DataFrame) -> bool:
+    """Print and judge one controller."""
+    equal = before["outcome"] == after["outcome"]
+    change = (before["position_error"] - after["position_error"]).abs()[equal & stood(before)]
+    median = float(change.median()) if len(change) else 0.0  # [m] nobody stood: nothing to compare
+    ok = equal.mean() >= EQUAL_OUTCOMES and median < POSITION_CHANGE
+    print(
+        f"{'ok    ' if ok else 'FAILED'} {name} {spec}: {int(equal.sum())}/{len(equal)} outcomes equal "
+        f"(at least {EQUAL_OUTCOMES:.0%}), median |change of position error| {median * 1000:.3f} mm over "
+        f"{len(change)} episodes (below {POSITION_CHANGE * 1000:g} mm)"
+    )
+    return bool(ok)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

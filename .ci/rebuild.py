@@ -1,0 +1,35 @@
+"""Rebuild every table, figure and the report from the committed records, and compare byte for byte."""
+
+import sys
+import tempfile
+from pathlib import Path
+
+from wbc_bench.publish import publish
+from wbc_bench.store import ResultStore
+
+
+def products(root: Path) -> dict[str, bytes]:
+    """Path below `root` -> bytes of everything that is made from records."""
+    paths = [*root.glob("tables/**/*"), *root.glob("figures/**/*"), *root.glob("report.html")]
+    return {str(path.relative_to(root)): path.read_bytes() for path in paths if path.is_file()}
+
+
+def main() -> int:
+    results = Path(sys.argv[1])
+    store, committed = ResultStore(results), products(results)
+    if not store.runs():
+        print(f"SKIPPED: no records under {results} yet")
+        return 1 if committed else 0  # tables without records are nobody's
+    with tempfile.TemporaryDirectory() as folder:
+        publish(store, Path(folder))
+        rebuilt = products(Path(folder))
+    problems = [f"not made by the records: {name}" for name in sorted(committed.keys() - rebuilt.keys())]
+    problems += [f"not committed: {name}" for name in sorted(rebuilt.keys() - committed.keys())]
+    both = sorted(rebuilt.keys() & committed.keys())
+    problems += [f"differs: {name}" for name in both if rebuilt[name] != committed[name]]
+    print(*problems, f"{len(both)} files compared, {len(problems)} problems", sep="\n")
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""Imports point down only: every import statement of the two packages is read, the lazy ones too."""
+
+import ast
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {"wbc_bench": ROOT / "wbc_bench", "wbc_baselines": ROOT / "baselines" / "wbc_baselines"}
+
+# From the table of contents of the design, top first: what stands below never imports what stands above.
+CHAINS = (
+    ("cli", "publish", "report", "tables", "analysis", "episodes"),
+    ("cli", "publish", "report", "plots", "analysis", "episodes"),
+    ("tables", "stats"),
+    ("publish", "store", "episodes"),
+    ("cli", "execution", "store"),
+    ("execution", "rollout", "simulation", "robot", "rotations"),
+    ("execution", "rollout", "controller", "robot", "errors"),
+    ("rollout", "observation", "protocol", "robot"),
+    ("freeze", "targets", "robot"),
+    ("freeze", "manifest", "protocol"),
+    ("execution", "metrics", "episodes"),
+)
+# Numbers are made of records alone: an analysis runs where neither physics nor learning is installed.
+PURE = ("metrics", "stats", "store", "analysis", "markup", "tables", "plots", "report", "episodes")
+HEAVY = ("mujoco", "torch", "pinocchio", "placo")
+
+
+def module_name(path: Path) -> str:
+    package = next(name for name, folder in PACKAGES.items() if path.is_relative_to(folder))
+    parts = path.relative_to(PACKAGES[package]).with_suffix("").parts
+    return ".".join([package, *parts]).removesuffix(".__init__")
+
+
+MODULES = {module_name(path): path for folder in PACKAGES.values() for path in sorted(folder.rglob("*.py"))}
+
+
+@cache
+def imports(module: str) -> dict[str, set[str]]:
+    """Imported module -> names taken from it (empty for `import x`), wherever the statement stands."""
+    found: dict[str, set[str]] = {}
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                found.setdefault(alias.name, set())
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative imports hide what is imported"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                if whole in MODULES:
+                    found.setdefault(whole, set())
+                else:
+                    found.setdefault(node.module or "", set()).add(alias.name)
+    return found
+
+
+@cache
+def reaches(module: str) -> frozenset[str]:
+    """Every module of the two packages, and every outside package, that an import of this one can lead to."""
+    seen: set[str] = set()
+    queue = [module]
+    while queue:
+        for name in imports(queue.pop()):
+            if name not in seen:
+                seen.add(name if name in MODULES else name.partition(".")[0])
+                if name in MODULES:
+                    queue.append(name)
+    return frozenset(seen)
+
+
+def group(module: str) -> str:
+    """The part of a package that a module belongs to: `robot` for wbc_bench.robot.mjcf."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def test_the_harness_knows_no_controller():
+    for module in MODULES:
+        if module.startswith("wbc_bench"):
+            assert not any(name.startswith("wbc_baselines") for name in imports(module)), module
+
+
+def test_baselines_use_public_names_only():
+    for module in MODULES:
+        if not module.startswith("wbc_baselines"):
+            continue
+        for name, taken in imports(module).items():
+            if name.startswith("wbc_bench"):
+                private = {part for part in (*name.split("."), *taken) if part.startswith("_")}
+                assert not private, f"{module} takes {private} from {name}"
+
+
+def test_baselines_do_not_know_each_other():
+    for module in MODULES:
+        if module.startswith("wbc_baselines.ik"):
+            assert not any(name.startswith("wbc_baselines.learned") for name in reaches(module)), module
+        if module.startswith("wbc_baselines.learned"):
+            assert not any(name.startswith("wbc_baselines.ik") for name in reaches(module)), module
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=" > ".join)
+def test_imports_point_down(chain):
+    for k, lower in enumerate(chain):
+        for module in (m for m in MODULES if m.startswith("wbc_bench.") and group(m) == lower):
+            above = {group(name) for name in reaches(module) if name.startswith("wbc_bench.")} & set(
+                chain[:k]
+            )
+            assert not above, f"{module} reaches {above}"
+
+
+def test_no_cycles():
+    """Between parts of the harness; inside a part (the robot's files) a module may import its neighbours."""
+    for module in MODULES:
+        for name in imports(module):
+            if name in MODULES and group(name) != group(module):
+                assert module not in reaches(name), f"{module} and {name} import each other"
+
+
+@pytest.mark.parametrize("name", PURE)
+def test_analysis_needs_neither_physics_nor_learning(name):
+    if f"wbc_bench.{name}" in MODULES:
+        assert not reaches(f"wbc_bench.{name}") & set(HEAVY)
+
+
+def test_the_command_line_starts_light():
+    """`wbc-bench --help` must not wait for numpy, let alone MuJoCo."""
+    heavy = (*HEAVY, "numpy", "pandas", "scipy", "matplotlib", "joblib")
+    code = f"import sys, wbc_bench.cli; print(*(m for m in {heavy} if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

@@ -1,0 +1,224 @@
+"""PlaCo and OSQP solve one and the same inverse-kinematics program."""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
+from wbc_baselines.ik.osqp_ik import OsqpIK, half_planes
+from wbc_baselines.ik.placo_ik import PlacoIK
+from wbc_baselines.ik.settings import Weights
+from wbc_baselines.ik.stance import base_from_stance, measured_stance
+
+from wbc_bench.manifest import manifest_path, read_manifest
+from wbc_bench.protocol import find_protocol
+from wbc_bench.robot import load_robot
+from wbc_bench.rotations import matrix_from_wxyz
+
+PERIOD = 0.02  # [s]
+# damped enough for a full Gauss-Newton step to come to rest beside the singularities of wrist and knees
+WEIGHTS = Weights(regularization=1e-3)
+ROBOT = load_robot()
+SOLVERS = {"placo": PlacoIK(ROBOT, WEIGHTS, PERIOD), "osqp": OsqpIK(ROBOT, WEIGHTS, PERIOD)}
+MODEL = WholeBodyModel(ROBOT)
+
+
+class Standing(NamedTuple):
+    """The default posture on flat ground, in the anchor frame."""
+
+    q: np.ndarray  # (21,)
+    ee: Pose
+    soles: list[Pose]
+    hull: np.ndarray  # (V, 2) [m]
+
+
+def _standing() -> Standing:
+    soles_b = MODEL.soles_in_base(ROBOT.default_q)
+    pos, rot = base_from_stance(soles_b, np.array([0.0, 0.0, 1.0]), None)
+    stance = measured_stance([(pos + rot @ p, rot @ r) for p, r in soles_b])
+    q = configuration(pos, rot, ROBOT.default_q)
+    return Standing(q, MODEL.ee_of(q), stance.poses(), stance.hull(MODEL.corners))
+
+
+START = _standing()
+
+
+def _targets(count: int) -> list[Pose]:
+    """Feasible targets that no table uses; the base stands over the world's origin at reset."""
+    protocol, path = find_protocol("tuning_nominal_v1")
+    manifest, _ = read_manifest(protocol, manifest_path(path))
+    rows = [np.flatnonzero(manifest.stratum == name)[: count // 2] for name in ("arm", "posture")]
+    shift = np.array([*START.q[:2], 0.0])
+    return [
+        (manifest.target_pos_w[i] + shift, matrix_from_wxyz(manifest.target_quat_w[i]))
+        for i in np.concatenate(rows)
+    ]
+
+
+def _slew(target: Pose, steps: int = 70, limit_speed: bool = True) -> dict[str, np.ndarray]:
+    """Configurations (steps + 1, 21) of each solver on the way to a target that takes 35 steps to arrive."""
+    way, turning = target[0] - START.ee[0], pin.log3(START.ee[1].T @ target[1])
+    paths = {}
+    for name, solver in SOLVERS.items():
+        path = [START.q]
+        for k in range(steps):
+            part = min(1.0, (k + 1) / 35)
+            ee = START.ee[0] + part * way, START.ee[1] @ pin.exp3(part * turning)
+            q = solver.step(path[-1], ee, START.soles, START.hull, ROBOT.default_q, limit_speed)
+            assert q is not None, f"{name}: no solution at step {k}"
+            path.append(q)
+        paths[name] = np.array(path)
+    return paths
+
+
+@pytest.fixture(scope="module")
+def paths() -> list[dict[str, np.ndarray]]:
+    return [_slew(target) for target in _targets(12)]
+
+
+def test_both_solvers_reach_the_same_poses(paths):
+    for path in paths:
+        (pos_a, rot_a), (pos_b, rot_b) = (MODEL.ee_of(path[name][-1]) for name in SOLVERS)
+        assert np.linalg.norm(pos_a - pos_b) < 1e-3  # [m]
+        assert np.linalg.norm(pin.log3(rot_a.T @ rot_b)) < 2e-3  # [rad]
+
+
+def test_both_solvers_take_the_same_steps(paths):
+    """OSQP from where PlaCo stands, so that differences do not add up along the way."""
+    for path, target in zip(paths, _targets(12), strict=True):
+        for q in path["placo"][::14]:
+            steps = [
+                s.step(q, target, START.soles, START.hull, ROBOT.default_q, False) for s in SOLVERS.values()
+            ]
+            # 1e-8, PlaCo's own damping on the base, is all that differs
+            np.testing.assert_allclose(steps[1], steps[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_steps_respect_limits(paths, name):
+    stride = PERIOD * WEIGHTS.speed_fraction * ROBOT.velocity
+    for path in paths:
+        joints = path[name][:, 7:]
+        assert (joints[1:] > ROBOT.lower + WEIGHTS.joint_margin - 1e-6).all()
+        assert (joints[1:] < ROBOT.upper - WEIGHTS.joint_margin + 1e-6).all()
+        assert (np.abs(np.diff(joints, axis=0)) < stride + 1e-6).all()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_mass_centre_stays_over_the_soles(paths, name):
+    normal, offset = half_planes(START.hull)
+    for path in paths:
+        for q in path[name]:
+            # the linearised margin holds up to the curvature of the motion
+            assert (normal @ MODEL.com_of(q)[:2] <= offset - WEIGHTS.com_margin + 2e-3).all()
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_soles_stay_where_they_stand(paths, name):
+    for path in paths:
+        for before, q in pairwise(path[name]):
+            MODEL.update(q)
+            left, right = (MODEL.pose(sole) for sole in MODEL.soles)
+            # a step removes the error to first order; what is left is its curvature, at most a metre of lever
+            slack = 1e-4 + np.abs(pin.difference(MODEL.model, before, q)).max() ** 2
+            for (pos, _), (pos_ref, _) in zip((left, right), START.soles, strict=True):
+                assert np.linalg.norm(pos - pos_ref) < slack
+            assert np.linalg.norm(pin.log3(left[1])) < slack
+            assert abs(pin.log3(right[1])[1]) < slack  # pitch; the soles are level and point ahead
+        MODEL.update(path[name][-1])
+        for sole, (pos_ref, _) in zip(MODEL.soles, START.soles, strict=True):
+            assert np.linalg.norm(MODEL.pose(sole)[0] - pos_ref) < 1e-4
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_contradiction_has_no_solution(name):
+    """A right sole to stand far ahead of the left one, or a stride ahead within one period."""
+    left, (pos, rot) = START.soles
+    for distance, limit_speed in ((1.5, False), (0.3, True)):
+        soles = [left, (pos + np.array([distance, 0.0, 0.0]), rot)]
+        step = SOLVERS[name].step(START.q, START.ee, soles, START.hull, ROBOT.default_q, limit_speed)
+        assert step is None
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_joint_beyond_what_its_speed_allows_has_no_solution(name):
+    q = START.q.copy()
+    q[-1] = ROBOT.upper[-1] + 1.0  # [rad]
+    assert SOLVERS[name].step(q, START.ee, START.soles, START.hull, ROBOT.default_q, True) is None
+
+
+def _random_case(rng: np.random.Generator):
+    """A configuration far from its targets, and the targets."""
+    move = rng.uniform(-0.4, 0.4, MODEL.model.nv)
+    q = pin.integrate(MODEL.model, START.q, move)
+    soles = [
+        (pos + rng.uniform(-0.1, 0.1, 3), rot @ pin.exp3(rng.uniform(-0.3, 0.3, 3)))
+        for pos, rot in START.soles
+    ]
+    ee = START.ee[0] + rng.uniform(-0.3, 0.3, 3), START.ee[1] @ pin.exp3(rng.uniform(-1, 1, 3))
+    return q, ee, soles, ROBOT.default_q + rng.uniform(-0.3, 0.3, 14)
+
+
+def _cost(q, ee, soles, posture) -> float:
+    """Half the weighted squared errors of the soft tasks, from forward kinematics alone."""
+    MODEL.update(q)
+    pos, rot = MODEL.pose(MODEL.tcp)
+    com = MODEL.data.com[0][:2]
+    flat = MODEL.pose(MODEL.soles[1])[1]
+    w = WEIGHTS
+    return 0.5 * (
+        w.ee_position * np.sum((pos - ee[0]) ** 2)
+        + w.ee_orientation * np.sum(pin.log3(rot.T @ ee[1]) ** 2)
+        + w.foot_flat * np.sum(pin.log3(flat.T @ soles[1][1]) ** 2)
+        + w.com * np.sum((com - START.hull.mean(axis=0)) ** 2)
+        + w.posture * np.sum((q[7:] - posture) ** 2)
+    )
+
+
+def test_gradient_of_the_program_is_that_of_its_cost():
+    """Exact however large the errors: the Jacobian of the logarithm maps a rotation vector to itself."""
+    rng = np.random.default_rng(0)
+    h = 1e-6
+    for _ in range(5):
+        q, ee, soles, posture = _random_case(rng)
+        program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture)
+        slope = [
+            (
+                _cost(pin.integrate(MODEL.model, q, d), ee, soles, posture)
+                - _cost(pin.integrate(MODEL.model, q, -d), ee, soles, posture)
+            )
+            / (2 * h)
+            for d in h * np.eye(MODEL.model.nv)
+        ]
+        np.testing.assert_allclose(program.c, slope, atol=1e-8)
+
+
+def test_rows_are_derivatives_of_their_errors():
+    """Foot constraints and polygon by finite differences, at feet that stand where they are asked to."""
+    rng = np.random.default_rng(1)
+    h = 1e-6
+    for _ in range(5):
+        q, ee, _, posture = _random_case(rng)
+        MODEL.update(q)
+        soles = [MODEL.pose(sole) for sole in MODEL.soles]
+
+        def errors(q, ee=ee, soles=soles, posture=posture):
+            program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture)
+            return np.concatenate([program.b, program.h])
+
+        program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture)
+        rows = np.concatenate([program.a, program.g])
+        slope = [
+            (errors(pin.integrate(MODEL.model, q, d)) - errors(pin.integrate(MODEL.model, q, -d))) / (2 * h)
+            for d in h * np.eye(MODEL.model.nv)
+        ]
+        np.testing.assert_allclose(-rows.T, slope, atol=1e-8)
+
+
+def test_half_planes_of_a_square():
+    square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]])
+    normal, offset = half_planes(square)
+    np.testing.assert_allclose(normal, [[0, -1], [1, 0], [0, 1], [-1, 0]], atol=1e-15)
+    np.testing.assert_allclose(offset, [0, 2, 1, 0], atol=1e-15)

@@ -1,0 +1,62 @@
+"""Figures: the same bytes for the same store, axes returned, curves that end where the episodes did."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from synthetic import FakeStore, reach_store, study_store
+
+from wbc_bench import analysis, plots, tables
+
+
+def targets() -> pd.DataFrame:
+    rng = np.random.default_rng(0)
+    stratum = np.array(["arm", "posture", "step"])[rng.integers(0, 3, 90)]
+    x, y, height = rng.uniform(0.2, 1.0, 90), rng.uniform(-0.5, 0.5, 90), rng.uniform(0.1, 1.8, 90)
+    return pd.DataFrame({"target_x": x, "target_y": y, "height": height, "stratum": stratum})
+
+
+def methods() -> list[tuple[str, analysis.Evaluated]]:
+    return tables.methods_of(tables.ABLATION, analysis.collect(study_store(), "ablation_v1"))
+
+
+def test_same_store_same_bytes(tmp_path):
+    for folder in (tmp_path / "one", tmp_path / "two"):
+        plots.write_reach(reach_store(), "reach_v1", folder)
+        plots.write_targets(targets(), "ablation_v1", folder)
+    files = sorted(path.name for path in (tmp_path / "one").iterdir())
+    assert len(files) == 2 * 2
+    for name in files:
+        data = (tmp_path / "one" / name).read_bytes()
+        assert data == (tmp_path / "two" / name).read_bytes(), name
+
+
+def test_files_of_a_study_carry_no_date_and_no_program(tmp_path):
+    paths = plots.write_study(study_store(), tables.ABLATION, tmp_path)
+    assert len(paths) == 2 * 3
+    for path in paths:
+        data = path.read_bytes()
+        assert b"dc:date" not in data and b"Software" not in data and b"Matplotlib v" not in data
+
+
+def test_nothing_to_draw_writes_nothing(tmp_path):
+    assert plots.write_study(FakeStore([]), tables.ABLATION, tmp_path) == []
+    assert plots.write_reach(FakeStore([]), "reach_v1", tmp_path) == []
+
+
+def test_a_plot_returns_its_axes():
+    ax = Figure().subplots()
+    assert plots.success_by_stratum(ax, methods()) is ax
+    assert plots.outcome_bars(Figure().subplots(), methods()).get_title()
+
+
+def test_outcome_bars_add_up_to_100():
+    ax = plots.outcome_bars(Figure().subplots(), methods())
+    bars = [bar for container in ax.containers for bar in container]
+    assert sum(bar.get_width() for bar in bars) == pytest.approx(100.0 * len(methods()))
+
+
+def test_a_cdf_ends_at_the_share_that_stood():
+    ax = plots.error_cdf(Figure().subplots(), methods(), "position_error")
+    for line, (_, method) in zip(ax.get_lines(), methods(), strict=False):
+        assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.stood.mean())

@@ -1,0 +1,100 @@
+"""Draws of an episode: independent streams, ranges, pushes, and a reset that stands on the ground."""
+
+import msgspec
+import mujoco
+import numpy as np
+import pytest
+
+from wbc_bench.protocol import MAX_PUSHES, Push, find_protocol
+from wbc_bench.randomization import EpisodeDraws, draw, draw_pushes, resting_height, undisturbed
+from wbc_bench.randomness import stream
+from wbc_bench.robot import load_robot
+
+SMOKE = find_protocol("smoke_v1")[0]
+
+
+def equal(a: EpisodeDraws, b: EpisodeDraws) -> bool:
+    return all(np.array_equal(x, y, equal_nan=True) for x, y in zip(a, b, strict=True))
+
+
+def test_order_and_subset_do_not_matter() -> None:
+    forward = {i: draw(SMOKE, 0, i) for i in range(6)}
+    assert all(equal(draw(SMOKE, 0, i), forward[i]) for i in (5, 2))
+    assert not equal(forward[0], forward[1])
+    assert not equal(forward[0], draw(SMOKE, 1, 0))
+
+
+def test_switching_one_quantity_off_leaves_the_others() -> None:
+    calm = msgspec.structs.replace(
+        SMOKE, push=Push(), randomization=msgspec.structs.replace(SMOKE.randomization, friction=(0.8, 0.8))
+    )
+    a, b = draw(SMOKE, 0, 3), draw(calm, 0, 3)
+    changed = {
+        name
+        for name in EpisodeDraws._fields
+        if not np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+    }
+    assert changed == {"friction", "push_time", "push_vel"}
+
+
+def test_draws_fill_their_ranges() -> None:
+    draws = [draw(SMOKE, 0, i) for i in range(400)]
+    spread = SMOKE.randomization
+    for name, low, high in (
+        ("friction", *spread.friction),
+        ("base_mass", *spread.base_mass),
+        ("leg_q", -spread.leg_q, spread.leg_q),
+        ("leg_qd", -spread.leg_qd, spread.leg_qd),
+        ("kp_scale", *spread.gain),
+        ("kd_scale", *spread.gain),
+    ):
+        values = np.array([getattr(d, name) for d in draws])
+        assert low <= values.min() and values.max() <= high
+        # mean of n uniform draws: standard deviation (high - low) / sqrt(12 n); five of them
+        slack = 5 * (high - low) / np.sqrt(12 * values.size)
+        assert abs(values.mean() - (low + high) / 2) < slack
+    columns = np.array([np.r_[d.friction, d.base_mass, d.leg_q, d.kp_scale, d.kd_scale] for d in draws])
+    apart = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(apart).max() < 5 / np.sqrt(len(draws))
+    assert len({d.noise_key for d in draws}) == len(draws)
+
+
+def test_pushes_keep_to_the_schedule() -> None:
+    push = Push(speed=0.5, interval=(1.0, 1.5), quiet_end=0.5)
+    counts = []
+    for i in range(200):
+        time, vel = draw_pushes(push, 2.9, stream(1, "push", i))
+        some = np.isfinite(time)
+        counts.append(some.sum())
+        assert some[0] and 1.0 <= time[0] <= 1.5
+        assert (time[some] < 2.4).all()
+        assert not some[1] or 1.0 <= time[1] - time[0] <= 1.5
+        assert (np.abs(vel) <= 0.5).all() and (vel[np.repeat(~some, 2)] == 0).all()
+    assert set(counts) == {1, MAX_PUSHES}
+    time, vel = draw_pushes(Push(speed=0.0), 10.0, stream(1, "push"))
+    assert np.isnan(time).all() and (vel == 0).all()
+
+
+def test_undisturbed_is_nominal() -> None:
+    calm = undisturbed(SMOKE, 0, 4)
+    robot = load_robot()
+    assert calm.friction == robot.facts.friction.slide and calm.noise_scale == 0
+    assert calm.base_mass == 0 and not calm.base_vel.any() and not calm.leg_q.any() and not calm.leg_qd.any()
+    assert (calm.kp_scale == 1).all() and (calm.kd_scale == 1).all() and np.isnan(calm.push_time).all()
+    assert calm.base_height == pytest.approx(robot.facts.nominal_base_height, abs=1e-3)
+
+
+def test_lowest_sole_touches_the_ground() -> None:
+    robot = load_robot()
+    model = robot.model()
+    data = mujoco.MjData(model)
+    ground = model.geom("ground").id
+    spheres = [model.geom(f"foot_{side}_{k}").id for side in "LR" for k in range(4)]
+    for i in range(5):
+        leg_q = draw(SMOKE, 0, i).leg_q
+        height = resting_height(SMOKE.robot, leg_q)
+        data.qpos[:] = [0, 0, height, 1, 0, 0, 0, *robot.default_q]
+        data.qpos[7:15] += leg_q
+        mujoco.mj_forward(model, data)
+        gaps = [mujoco.mj_geomDistance(model, data, g, ground, 1.0, None) for g in spheres]
+        assert min(gaps) == pytest.approx(0, abs=1e-9)

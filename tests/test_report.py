@@ -1,0 +1,56 @@
+"""The report: one self-contained file with every table, figure and run."""
+
+import re
+
+import pytest
+from synthetic import FakeStore, reach_store, record, study_store
+
+from wbc_bench import plots, report, stats, tables
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch):
+    monkeypatch.setattr(stats, "RESAMPLES", 200)  # these tests read the tables, not the intervals
+
+
+def full_store() -> FakeStore:
+    return FakeStore(study_store(count=30).all_runs + reach_store().all_runs)
+
+
+def test_report_holds_everything_and_loads_nothing(tmp_path):
+    store = full_store()
+    tables.write_study(store, tables.ABLATION, tmp_path / "tables")
+    tables.write_reach(store, "reach_v1", tmp_path / "tables")
+    plots.write_reach(store, "reach_v1", tmp_path / "figures")
+    path = report.write(store, tmp_path)
+    text = path.read_text(encoding="utf-8")
+    assert path == tmp_path / "report.html"
+    assert "88.30 ± 2.50" in text and "ik vs hold" in text and "38–163" in text
+    assert text.count("<img ") == 1 and "data:image/svg+xml;base64," in text
+    # Nothing is fetched: every source is inside, every link stays on the page.
+    assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', text))
+    assert all(link.startswith("#") for link in re.findall(r'href="([^"]*)"', text))
+    assert text.count("d" * 12) >= 12 and "a" * 64 in text  # a digest a run
+    before = path.read_bytes()
+    assert report.write(store, tmp_path).read_bytes() == before
+
+
+def test_each_table_stands_under_its_own_protocol(tmp_path):
+    store = full_store()
+    tables.write_study(store, tables.ABLATION, tmp_path / "tables")
+    tables.write_reach(store, "reach_v1", tmp_path / "tables")
+    text = report.write(store, tmp_path).read_text(encoding="utf-8")
+    ablation, reach = text.index('<h2 id="s0">ablation_v1'), text.index('<h2 id="s1">reach_v1')
+    assert ablation < text.index("ik vs hold") < reach < text.index("38–163")
+
+
+def test_an_empty_store_says_so(tmp_path):
+    assert "No run yet" in report.write(FakeStore([]), tmp_path).read_text(encoding="utf-8")
+
+
+def test_dirty_trees_and_markup_in_records_show_as_text(tmp_path):
+    run = study_store(count=4, replicates=1).all_runs[0]
+    dirty = type(run)(record("<b>mine</b>", 0, run.frame, git_dirty=True), run.frame)
+    text = report.write(FakeStore([dirty]), tmp_path).read_text(encoding="utf-8")
+    assert "uncommitted changes" in text
+    assert "<b>mine</b>" not in text and "&lt;b&gt;mine" in text and "&lt;made up&gt;" in text

@@ -1,0 +1,259 @@
+"""The store: atomic, resumable, and never mixing answers to different questions."""
+
+import errno
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from wbc_bench import store as store_module
+from wbc_bench.errors import StoreError, UnknownNameError
+from wbc_bench.store import ResultStore, RunKey, RunWriter, ShardCost, write_atomic
+
+FACTS = {
+    **{"controller_name": "a", "signals": [], "source": "test", "checkpoint_sha256": None},
+    **{"git_commit": None, "git_dirty": False, "versions": {}, "machine": {}, "workers": 1, "engine": "loky"},
+    **{"wall_time_s": 1.0, "created": "2026-01-01T00:00:00+00:00"},
+}
+COST = ShardCost(0.5, 100.0)
+
+
+def key(**changes) -> RunKey:
+    values = {
+        **{"protocol": "p", "protocol_digest": "d" * 64, "manifest_sha256": "m" * 64, "controller": "a:b"},
+        **{"replicate": 0, "requested": 7, "shard_episodes": 3, "software_sha256": "s" * 64},
+    }
+    return RunKey(**(values | changes))
+
+
+def rows(numbers: range, seed: int = 0) -> pa.Table:
+    value = np.random.default_rng(seed).normal(size=100)[list(numbers)]
+    return pa.table({"episode": list(numbers), "outcome": ["success"] * len(numbers), "value": value})
+
+
+def fill(writer: RunWriter, seed: int = 0) -> None:
+    for shard in writer.missing:
+        writer.write(shard, rows(writer.rows(shard), seed), COST)
+
+
+def finished(root: Path, seed: int = 0, **changes) -> ResultStore:
+    store = ResultStore(root)
+    writer = RunWriter(store, key(**changes))
+    fill(writer, seed)
+    writer.finish(FACTS)
+    writer.close()
+    return store
+
+
+def test_a_run_is_its_shards_in_order_and_nothing_else_is_left(tmp_path):
+    store = ResultStore(tmp_path)
+    writer = RunWriter(store, key())
+    assert writer.missing == [0, 1, 2]
+    assert [list(writer.rows(shard)) for shard in writer.missing] == [[0, 1, 2], [3, 4, 5], [6]]
+    for shard in (2, 0, 1):
+        writer.write(shard, rows(writer.rows(shard)), COST)
+    record = writer.finish(FACTS).record
+    writer.close()
+    assert (record.requested, record.completed, sum(record.outcomes.values())) == (7, 7, 7)
+    assert record.compute_time_s == 1.5
+    (run,) = store.runs("p")
+    assert run.episodes()["episode"].tolist() == list(range(7))
+    assert sorted(p.name for p in run.path.iterdir()) == ["episodes.parquet", "run.json"]
+
+
+def test_bytes_do_not_depend_on_order_interruption_or_software(tmp_path):
+    one = finished(tmp_path / "one").runs()[0].path / "episodes.parquet"
+    store = ResultStore(tmp_path / "two")
+    changed = key(software_sha256="t" * 64)
+    writer = RunWriter(store, changed)
+    writer.write(2, rows(writer.rows(2)), COST)
+    writer.close()
+    writer = RunWriter(store, changed)
+    assert (writer.missing, writer.resumed) == ([0, 1], 1)
+    fill(writer)
+    two = writer.finish(FACTS).path / "episodes.parquet"
+    writer.close()
+    assert one.read_bytes() == two.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped bit", "empty", "short"])
+def test_a_damaged_shard_is_computed_again(tmp_path, damage):
+    store = ResultStore(tmp_path)
+    writer = RunWriter(store, key())
+    fill(writer)
+    path = writer.path / "shards" / "shard_00001.parquet"
+    data = bytearray(path.read_bytes())
+    if damage == "short":
+        writer.write(1, rows(range(3, 5)), COST)
+    else:
+        data[8] ^= 1 if damage == "flipped bit" else 0
+        path.write_bytes({"truncated": data[:-20], "flipped bit": data, "empty": b""}[damage])
+    writer.close()
+    writer = RunWriter(store, key())
+    assert writer.missing == [1]
+    writer.close()
+
+
+def test_leftovers_of_a_killed_writer_are_removed(tmp_path):
+    store = ResultStore(tmp_path)
+    writer = RunWriter(store, key())
+    writer.write(0, rows(range(3)), COST)
+    leftover = writer.path / "shards" / ".shard_00001.parquet.123.tmp"
+    leftover.write_bytes(b"half")
+    writer.close()
+    writer = RunWriter(store, key())
+    assert not leftover.exists()
+    assert writer.missing == [1, 2]
+    writer.close()
+
+
+def test_killed_between_record_and_clean_up(tmp_path):
+    store = ResultStore(tmp_path)
+    writer = RunWriter(store, key())
+    fill(writer)
+    shutil.copytree(writer.path / "shards", tmp_path / "kept")
+    run = writer.finish(FACTS)
+    writer.close()
+    shutil.copytree(tmp_path / "kept", run.path / "shards")
+    writer = RunWriter(store, key())
+    assert writer.missing == [] and writer.finished
+    writer.close()
+    assert not (run.path / "shards").exists()
+
+
+@pytest.mark.parametrize("field", ["protocol_digest", "manifest_sha256", "controller", "requested"])
+@pytest.mark.parametrize("whole", [True, False])
+def test_another_question_is_refused(tmp_path, field, whole):
+    if whole:
+        store = finished(tmp_path)
+    else:
+        store = ResultStore(tmp_path)
+        writer = RunWriter(store, key())
+        writer.write(0, rows(range(3)), COST)
+        writer.close()
+    # "a-b" shares the folder of "a:b"
+    other = {"controller": "a-b", "requested": 6}.get(field, "x" * 64)
+    with pytest.raises(StoreError, match=field):
+        RunWriter(store, key(**{field: other}))
+    RunWriter(store, key(**{field: other}), redo=True).close()
+
+
+def test_shards_of_other_software_are_refused_but_a_whole_run_is_kept(tmp_path):
+    store = ResultStore(tmp_path)
+    writer = RunWriter(store, key())
+    writer.write(0, rows(range(3)), COST)
+    writer.close()
+    with pytest.raises(StoreError, match="software_sha256"):
+        RunWriter(store, key(software_sha256="t" * 64))
+    whole = finished(tmp_path / "whole")
+    writer = RunWriter(whole, key(software_sha256="t" * 64))
+    assert writer.finished
+    writer.close()
+
+
+def test_load_refuses_to_mix_digests(tmp_path):
+    store = finished(tmp_path)
+    finished(tmp_path, replicate=1)
+    assert len(store.load("p", "a:b")) == 14
+    finished(tmp_path, replicate=2, protocol_digest="e" * 64)
+    with pytest.raises(StoreError, match=f"{'d' * 64}.*{'e' * 64}"):
+        store.load("p", "a:b")
+    with pytest.raises(UnknownNameError, match="a:b"):
+        store.load("p", "a:c")
+
+
+def test_altered_episodes_are_noticed(tmp_path):
+    (run,) = finished(tmp_path / "a").runs()
+    (other,) = finished(tmp_path / "b", seed=1).runs()
+    shutil.copy(other.path / "episodes.parquet", run.path / "episodes.parquet")
+    with pytest.raises(StoreError, match="sha256"):
+        run.episodes()
+
+
+def test_a_damaged_record_names_its_file(tmp_path):
+    store = finished(tmp_path)
+    path = store.runs()[0].path / "run.json"
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(StoreError, match=r"run\.json"):
+        store.runs()
+
+
+def test_two_processes_do_not_share_a_run(tmp_path):
+    store = ResultStore(tmp_path)
+    writer = RunWriter(store, key())
+    with pytest.raises(StoreError, match="another process"):
+        RunWriter(store, key())
+    writer.close()
+    RunWriter(store, key()).close()
+
+
+def test_full_disk_at_any_write_leaves_no_part(tmp_path, monkeypatch):
+    """Fail at the k-th fsync of a file, for every k: what is there is whole, and the run can go on."""
+    real = os.fsync
+    for failing in range(1, 6):
+        store = ResultStore(tmp_path / str(failing))
+        writer = RunWriter(store, key())
+        calls = iter(range(1, 100))
+
+        def fsync(descriptor, calls=calls, failing=failing):
+            if not os.path.isdir(f"/proc/self/fd/{descriptor}") and next(calls) == failing:  # noqa: PTH112
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            real(descriptor)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+        with pytest.raises(StoreError, match="No space left"):
+            fill(writer)
+            writer.finish(FACTS)
+        writer.close()
+        monkeypatch.setattr(os, "fsync", real)
+        assert not list(writer.path.rglob("*.tmp"))
+        assert store.runs() == []
+        writer = RunWriter(store, key())
+        assert len(writer.missing) == max(0, 4 - failing)
+        fill(writer)
+        run = writer.finish(FACTS)
+        writer.close()
+        reference = finished(tmp_path / f"reference{failing}").runs()[0]
+        assert (run.path / "episodes.parquet").read_bytes() == (
+            reference.path / "episodes.parquet"
+        ).read_bytes()
+
+
+def test_a_really_full_disk(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(disk)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a small disk needs root")
+    try:
+        whole = disk / "whole"
+        write_atomic(whole, b"x" * 20_000)
+        with pytest.raises(StoreError, match="No space left"):
+            write_atomic(disk / "big", b"x" * 100_000)
+        with pytest.raises(StoreError, match="No space left"):
+            write_atomic(whole, b"y" * 100_000)
+        assert [p.name for p in disk.iterdir()] == ["whole"]
+        assert whole.read_bytes() == b"x" * 20_000
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_probe_refuses_what_cannot_be_written(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("")
+    for root in (file, file / "below"):
+        with pytest.raises(StoreError, match="results folder"):
+            ResultStore(root).probe()
+    ResultStore(tmp_path / "new" / "folder").probe()
+    assert list((tmp_path / "new" / "folder").iterdir()) == []
+
+
+def test_record_round_trips(tmp_path):
+    (run,) = finished(tmp_path).runs()
+    again = msgspec.json.decode((run.path / "run.json").read_bytes(), type=store_module.RunRecord)
+    assert again == run.record

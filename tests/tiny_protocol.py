@@ -1,0 +1,78 @@
+"""A protocol and manifest of a few steps an episode, in as many shards as a test wants."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from wbc_bench.manifest import EpisodeManifest, manifest_path, write_manifest
+from wbc_bench.protocol import MAX_PUSHES, load_protocol
+
+TOML = """
+name = "tiny"
+description = "A few steps."
+
+[episodes]
+replicates = {replicates}
+per_replicate = {episodes}
+horizon = {horizon}
+seed = 1
+
+[targets]
+type = "workspace"
+x = [0.0, 1.0]
+y = [0.0, 1.0]
+height = [0.0, 1.0]
+roll = [0.0, 0.0]
+pitch = [0.0, 0.0]
+yaw = [0.0, 0.0]
+weights = {{ arm = 1 }}
+step_distance = [0.1, 0.2]
+step_yaw = [0.0, 0.0]
+
+[noise]
+joint_pos = 0.01
+
+[success]
+window = 0.1
+"""
+
+
+def manifest(replicates: int, episodes: int) -> EpisodeManifest:
+    """Targets on a line, friction and speeds drawn: enough that no two episodes are alike."""
+    count = replicates * episodes
+    rng = np.random.default_rng(0)
+    return EpisodeManifest(
+        replicate=np.repeat(np.arange(replicates), episodes),
+        episode=np.tile(np.arange(episodes), replicates),
+        stratum=np.full(count, "arm", dtype=object),
+        condition=np.full(count, "", dtype=object),
+        orientation=np.full(count, "", dtype=object),
+        height=np.full(count, 0.9),
+        target_pos_w=np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.full(count, 0.9)]),
+        target_quat_w=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        witness_qpos=np.full((count, 21), np.nan),
+        base_height=np.full(count, 0.85),
+        friction=rng.uniform(0.5, 1.0, count),
+        base_mass=rng.uniform(0.0, 1.0, count),
+        base_vel=rng.uniform(-0.1, 0.1, (count, 6)),
+        leg_q=np.zeros((count, 8)),
+        leg_qd=np.zeros((count, 8)),
+        kp_scale=np.ones((count, 14)),
+        kd_scale=np.ones((count, 14)),
+        push_time=np.full((count, MAX_PUSHES), np.nan),
+        push_vel=np.zeros((count, 2 * MAX_PUSHES)),
+        noise_key=np.arange(count),
+        noise_scale=np.ones(count),
+    )
+
+
+def write_tiny(folder: Path, replicates: int = 2, episodes: int = 6, horizon: float = 0.2) -> Path:
+    """Write protocol, manifest and hash; the path of the protocol."""
+    path = folder / "tiny.toml"
+    path.write_text(TOML.format(replicates=replicates, episodes=episodes, horizon=horizon))
+    frozen = manifest_path(path)
+    write_manifest(manifest(replicates, episodes), load_protocol(path), frozen)
+    sha256 = hashlib.sha256(frozen.read_bytes()).hexdigest()
+    frozen.with_suffix(".sha256").write_text(f"{sha256}  {frozen.name}\n")
+    return path

@@ -1,0 +1,204 @@
+"""What tables and plots both ask of a store: runs grouped by controller, strata, and the rule of reach.
+
+Pure functions of the episode records; no file is written here.
+"""
+
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from wbc_bench.episodes import STRATA, TERMINATED
+from wbc_bench.errors import StoreError
+
+FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PAPER_SIGNALS = frozenset({"proprioception", "ee_pose"})  # what the paper's policy may see (its Table I)
+# Reach: the protocol's tolerance (the paper's success rule) is the rule of `reached` too.
+REACH_TOLERANCE = 0.05  # [m]
+END_ZONE = 0.10  # [m] "near an end" of the range: two steps of 5 cm to either side
+
+
+class RunLike(Protocol):
+    @property
+    def record(self) -> Any: ...
+    def episodes(self) -> pd.DataFrame: ...
+
+
+class StoreLike(Protocol):
+    def runs(self, protocol: str | None = None) -> Sequence[Any]: ...
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """All replicates of one controller under one protocol."""
+
+    spec: str
+    records: tuple[Any, ...]
+    episodes: pd.DataFrame  # the episode record, replicates concatenated
+
+    @property
+    def requested(self) -> int:
+        return sum(record.requested for record in self.records)
+
+    @property
+    def completed(self) -> int:
+        return len(self.episodes)
+
+    @property
+    def counts(self) -> str:
+        return f"{self.completed}/{self.requested}"
+
+    @property
+    def extra_signals(self) -> list[str]:
+        """Signals it reads and the paper's policy does not."""
+        return sorted(set(self.records[0].signals) - PAPER_SIGNALS)
+
+    @property
+    def trained(self) -> bool:
+        return any(record.checkpoint_sha256 for record in self.records)
+
+    @property
+    def stood(self) -> Mask:
+        return stood(self.episodes)
+
+
+def collect(store: StoreLike, protocol: str) -> dict[str, Evaluated]:
+    """Spec -> its runs under a protocol, sorted by spec.
+
+    Raises: StoreError when two runs answered different protocols or manifests under the same name.
+    """
+    runs = sorted(store.runs(protocol), key=lambda run: (run.record.controller, run.record.replicate))
+    first: dict[str, tuple[str, str]] = {}  # what must agree -> (value, the first run that said so)
+    for record in (run.record for run in runs):
+        for key, value in (
+            ("protocol digest", record.protocol_digest),
+            (f"manifest of replicate {record.replicate}", record.manifest_sha256),
+        ):
+            known, owner = first.setdefault(key, (value, record.controller))
+            if known != value:
+                raise StoreError(
+                    f"runs of '{protocol}' answer different questions: {key} is {known} for '{owner}' and "
+                    f"{value} for '{record.controller}'; evaluate both again under one protocol"
+                )
+    grouped: dict[str, list[Any]] = {}
+    for run in runs:
+        grouped.setdefault(run.record.controller, []).append(run)
+    return {
+        spec: Evaluated(
+            spec,
+            tuple(run.record for run in group),
+            pd.concat([run.episodes() for run in group], ignore_index=True),
+        )
+        for spec, group in grouped.items()
+    }
+
+
+def column(episodes: pd.DataFrame, name: str) -> FloatArray:
+    """One numeric column, (N,)."""
+    return np.asarray(episodes[name], dtype=np.float64)
+
+
+def subset(episodes: pd.DataFrame, mask: Mask) -> pd.DataFrame:
+    """The rows where `mask` holds."""
+    return episodes.take(np.flatnonzero(mask))
+
+
+def stood(episodes: pd.DataFrame) -> Mask:
+    """Which episodes did not terminate, (N,)."""
+    return ~np.isin(np.asarray(episodes["outcome"], dtype=str), [str(outcome) for outcome in TERMINATED])
+
+
+def median(values: FloatArray) -> float:
+    """Median of the defined values; NaN without one."""
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def strata_of(episodes: pd.DataFrame) -> list[str]:
+    """Strata present, in the usual order; `beyond` (no feasible pose exists) comes last."""
+    present = set(episodes["stratum"])
+    return [s for s in (*STRATA, "beyond") if s in present] + sorted(present - {*STRATA, "beyond"})
+
+
+@cache
+def paper_values() -> dict[str, Any]:
+    text = resources.files("wbc_bench").joinpath("paper_values.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)
+
+
+def slug(spec: str) -> str:
+    """A controller spec as part of a file name."""
+    return re.sub(r"[^A-Za-z0-9_.]+", "-", spec).strip("-")
+
+
+class HeightRange(NamedTuple):
+    low: float  # [m], NaN when nothing was reached
+    high: float
+    reached: int  # heights reached, also outside the longest run
+
+
+def reached(episodes: pd.DataFrame) -> bool:
+    """Whether the median error over the episodes of one height is below the tolerance.
+
+    A terminated episode, or one without a value, counts as infinitely far; so more than half must have stood.
+    """
+    error = column(episodes, "position_error")
+    return bool(np.median(np.where(stood(episodes) & ~np.isnan(error), error, np.inf)) < REACH_TOLERANCE)
+
+
+def by_height(episodes: pd.DataFrame) -> list[tuple[float, pd.DataFrame]]:
+    """(height [m], its episodes), lowest first."""
+    # Rounded to 1 mm: heights are a grid of centimetres that went through floating point.
+    height = column(episodes, "height").round(3)
+    return [(float(h), subset(episodes, height == h)) for h in np.unique(height)]
+
+
+def contiguous_range(heights: Sequence[float], good: Sequence[bool]) -> HeightRange:
+    """Longest run of neighbouring heights of the grid that are all good; the lower of two equals."""
+    best, start = (0, 0), None
+    for k, ok in enumerate([*good, False]):
+        if ok and start is None:
+            start = k
+        elif not ok and start is not None:
+            if k - start > best[1] - best[0]:
+                best = (start, k)
+            start = None
+    if best[0] == best[1]:
+        return HeightRange(np.nan, np.nan, 0)
+    return HeightRange(heights[best[0]], heights[best[1] - 1], int(sum(good)))
+
+
+def reach_range(episodes: pd.DataFrame, strict: bool = False) -> HeightRange:
+    """Range of heights reached; strict asks that more than half of a height's episodes succeed."""
+    groups = by_height(episodes)
+    good = [column(g, "success").mean() > 0.5 if strict else reached(g) for _, g in groups]
+    return contiguous_range([height for height, _ in groups], good)
+
+
+def oscillation(episodes: pd.DataFrame, span: HeightRange, metric: str) -> tuple[float, float, float]:
+    """Median of a metric over episodes that stood: near the low end of a range, between, near the high end.
+
+    Near is within END_ZONE on either side, so also just outside of the range.
+    """
+    kept = subset(episodes, stood(episodes))
+    height, values = column(kept, "height"), column(kept, metric)
+    zone = END_ZONE + 1e-6  # the grid went through floating point
+    low, high = np.abs(height - span.low) <= zone, np.abs(height - span.high) <= zone
+    middle = (height > span.low) & (height < span.high) & ~low & ~high
+    return median(values[low]), median(values[middle]), median(values[high])
+
+
+def variants(episodes: pd.DataFrame) -> list[tuple[str, str, pd.DataFrame]]:
+    """(condition, orientation, episodes), in alphabetical order: nominal before randomised."""
+    condition, orientation = (np.asarray(episodes[name], dtype=str) for name in ("condition", "orientation"))
+    keys = sorted(set(zip(condition, orientation, strict=True)))
+    return [(str(c), str(o), subset(episodes, (condition == c) & (orientation == o))) for c, o in keys]

@@ -1,0 +1,490 @@
+"""The command line: `wbc-bench COMMAND --help`.
+
+Each command is a frozen dataclass, its fields the options. Everything heavy is imported when a command runs.
+"""
+
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, subcommand
+
+from wbc_bench.errors import BenchError, UnknownNameError
+
+if TYPE_CHECKING:
+    from wbc_bench.execution import Engine
+    from wbc_bench.robot import RobotConfig
+    from wbc_bench.store import ResultStore
+
+# One thread a worker, whatever a library would like: set before numpy is loaded, inherited by workers.
+THREADS = {
+    f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB_MAXIMUM")
+}
+BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
+
+
+class UsageError(BenchError):
+    """An option out of its range."""
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    """Options of every command that evaluates."""
+
+    workers: int = field(default_factory=_cores)
+    """Processes; the results do not depend on it."""
+    engine: str = "loky"
+    """loky (this machine), dask (a cluster started here) or dask=ADDRESS (a running scheduler)."""
+    out: Path = Path("results")
+    """Folder of records, tables and figures; an interrupted evaluation resumes there."""
+    redo: FlagCreatePairsOff[bool] = False
+    """Evaluate again what is already there."""
+
+    def _engine(self) -> "Engine":
+        from wbc_bench.execution import Engine
+
+        _at_least_one("--workers", self.workers)
+        return Engine.parse(self.engine, self.workers)
+
+    def _evaluate(
+        self,
+        protocol_name: str,
+        specs: tuple[str, ...],
+        seeds: int | None,
+        episodes: int | None,
+        optional: bool = False,
+    ) -> "ResultStore":
+        """Check everything, then run; with `optional`, what cannot be loaded is skipped with a line."""
+        from wbc_bench.controller import load_controller
+        from wbc_bench.execution import Job, run_jobs
+        from wbc_bench.manifest import manifest_path, read_manifest
+        from wbc_bench.protocol import find_protocol
+        from wbc_bench.robot import load_robot
+        from wbc_bench.store import ResultStore
+
+        if not specs:
+            raise UsageError("--controller: give at least one")
+        engine = self._engine()
+        protocol, path = find_protocol(protocol_name)
+        asked = protocol.episodes
+        seeds = _within("--seeds", seeds, asked.replicates, f"replicates of {protocol.name}")
+        episodes = _within(
+            "--episodes", episodes, asked.per_replicate, f"episodes a replicate of {protocol.name}"
+        )
+        manifest, sha256 = read_manifest(protocol, manifest_path(path))
+        robot, found = load_robot(protocol.robot), []
+        for spec in dict.fromkeys(specs):
+            try:
+                load_controller(spec, robot)
+                found.append(spec)
+            except BenchError as error:
+                if not optional:
+                    raise
+                print(f"not evaluated: {spec}: {error}", file=sys.stderr)
+        store = ResultStore(self.out)
+        store.probe()
+        jobs = [Job(protocol, manifest, sha256, spec, range(seeds), episodes) for spec in found]
+        run_jobs(jobs, store, engine, self.redo)
+        return store
+
+
+@dataclass(frozen=True)
+class Ablation(_Evaluation):
+    """Evaluate every method of the paper's study on the same episodes, and write its tables and figures."""
+
+    seeds: int | None = None
+    """Replicates of the protocol to run; all of them when not given."""
+    episodes: int | None = None
+    """First episodes of each replicate; all of them when not given."""
+    controllers: tuple[str, ...] = ()
+    """Controllers instead of the study's own list."""
+
+    def run(self) -> None:
+        from wbc_bench import tables
+        from wbc_bench.publish import publish
+
+        study = tables.ABLATION
+        specs = self.controllers or tuple(tables.Row(*row).spec for row in study.rows)
+        store = self._evaluate(
+            study.protocol, specs, self.seeds, self.episodes, optional=not self.controllers
+        )
+        publish(store, self.out)
+        _print_table(tables.paper_table(store, study))
+        pairs = tables.pair_table(store, study)
+        if pairs.rows:
+            _print_table(pairs)
+        print(f"tables, figures and report.html are under {self.out}")
+
+
+@dataclass(frozen=True)
+class Reach(_Evaluation):
+    """Find the heights that controllers reach straight ahead, and write the figure."""
+
+    controller: tuple[str, ...] = ("ik",)
+    """Controllers: name, name:variant, module:attribute or file.py:attribute."""
+    protocol: str = "reach_v1"
+    """Name or .toml file of a reach protocol."""
+
+    def run(self) -> None:
+        from wbc_bench import tables
+        from wbc_bench.protocol import ReachTargets, find_protocol
+        from wbc_bench.publish import publish
+
+        protocol, _ = find_protocol(self.protocol)
+        if not isinstance(protocol.targets, ReachTargets):
+            raise UsageError(f"--protocol {self.protocol}: its targets are not of type 'reach'")
+        store = self._evaluate(self.protocol, self.controller, None, None)
+        publish(store, self.out)
+        _print_table(tables.reach_table(store, protocol.name))
+        print(f"tables, figures and report.html are under {self.out}")
+
+
+@dataclass(frozen=True)
+class Eval(_Evaluation):
+    """Evaluate controllers under any protocol and print how the episodes ended."""
+
+    controller: tuple[str, ...] = tyro.MISSING
+    """Controllers: name, name:variant, module:attribute or file.py:attribute."""
+    protocol: str = tyro.MISSING
+    """Name of a released protocol, or a .toml file with its manifest beside it."""
+    seeds: int | None = None
+    """Replicates to run; all of them when not given."""
+    episodes: int | None = None
+    """First episodes of each replicate; all of them when not given."""
+
+    def run(self) -> None:
+        from wbc_bench import tables
+        from wbc_bench.protocol import find_protocol
+
+        store = self._evaluate(self.protocol, self.controller, self.seeds, self.episodes)
+        study = tables.Study(find_protocol(self.protocol)[0].name, ())
+        _print_table(tables.paper_table(store, study))
+        _print_table(tables.outcome_table(store, study))
+        print(f"records are under {self.out}; `wbc-bench report` makes tables and figures of them")
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare two evaluated controllers on the episodes that both met."""
+
+    a: Positional[str]
+    """Controller."""
+    b: Positional[str]
+    """Controller it is compared with."""
+    protocol: str = "ablation_v1"
+    """Protocol of the runs."""
+    results: Path = Path("results")
+    """Folder of the records."""
+    out: Path | None = None
+    """Also write the table into this folder."""
+
+    def run(self) -> None:
+        from wbc_bench import tables
+        from wbc_bench.store import ResultStore
+
+        store = ResultStore(self.results)
+        _print_table(tables.compare_table(store, self.protocol, self.a, self.b))
+        if self.out:
+            ResultStore(self.out).probe()
+            tables.write_compare(store, self.protocol, self.a, self.b, self.out)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Make every table, every figure and report.html anew from the records; nothing is evaluated."""
+
+    results: Path = Path("results")
+    """Folder of the records."""
+    out: Path | None = None
+    """Where to write; the folder of the records when not given."""
+
+    def run(self) -> None:
+        from wbc_bench.publish import publish
+        from wbc_bench.store import ResultStore
+
+        for path in publish(ResultStore(self.results), self.out or self.results):
+            print(path)
+
+
+@dataclass(frozen=True)
+class List:
+    """List controllers, protocols, metrics, benchmarks and runs."""
+
+    results: Path = Path("results")
+    """Folder of the records."""
+
+    def run(self) -> None:
+        from importlib.metadata import entry_points
+
+        from wbc_bench.controller import controllers
+        from wbc_bench.manifest import manifest_path
+        from wbc_bench.markup import Table
+        from wbc_bench.metrics import METRICS
+        from wbc_bench.protocol import find_protocol, protocol_names
+        from wbc_bench.store import ResultStore
+
+        rows = [(name, point.value) for name, point in sorted(controllers().items())]
+        _print_table(Table("controllers", "Controllers", ("Name", "Comes from"), tuple(rows)))
+        rows = []
+        for name in protocol_names():
+            protocol, path = find_protocol(name)
+            episodes = protocol.episodes
+            size = f"{episodes.replicates} x {episodes.per_replicate} x {episodes.horizon:g} s"
+            frozen = "yes" if manifest_path(path).exists() else "no"
+            rows.append((name, size, frozen, protocol.digest[:12], protocol.description))
+        header = ("Name", "Replicates x episodes", "Frozen", "Digest", "Description")
+        _print_table(Table("protocols", "Protocols", header, tuple(rows)))
+        rows = [(metric.name, metric.unit, metric.better, metric.source) for metric in METRICS]
+        _print_table(Table("metrics", "Metrics", ("Name", "Unit", "Better", "Source"), tuple(rows)))
+        rows = [(point.name, point.value) for point in entry_points(group=BENCHMARKS)]
+        _print_table(Table("benchmarks", "Benchmarks", ("Name", "Comes from"), tuple(rows)))
+        store = ResultStore(self.results)
+        rows = [
+            (
+                *(run.record.protocol, run.record.controller, str(run.record.replicate)),
+                *(f"{run.record.completed}/{run.record.requested}", run.record.created),
+                (run.record.git_commit or "no commit")[:12] + ("+" if run.record.git_dirty else ""),
+            )
+            for run in store.runs()
+        ]
+        rows += [
+            (
+                path.parents[1].name,
+                path.parent.name,
+                path.name.removeprefix("replicate_"),
+                f"{shards} shards",
+                "",
+                "",
+            )
+            for path, shards in store.unfinished()
+        ]
+        header = ("Protocol", "Controller", "Replicate", "Episodes", "Created (UTC)", "Commit")
+        _print_table(Table("runs", f"Runs under {self.results}", header, tuple(rows)))
+
+
+@dataclass(frozen=True)
+class Freeze:
+    """Draw the manifest of a protocol and write it beside the protocol file."""
+
+    name: Positional[str]
+    """Name of a released protocol, or a .toml file."""
+    workers: int = field(default_factory=_cores)
+    """Processes; the manifest does not depend on it."""
+
+    def run(self) -> None:
+        from wbc_bench.freeze import freeze
+        from wbc_bench.manifest import manifest_path
+        from wbc_bench.progress import Progress
+        from wbc_bench.protocol import find_protocol
+
+        _at_least_one("--workers", self.workers)
+        protocol, path = find_protocol(self.name)
+        with Progress("draws") as progress:
+            sha256 = freeze(protocol, manifest_path(path), progress.update, self.workers)
+        print(f"{sha256}  {manifest_path(path)}")
+
+
+@dataclass(frozen=True)
+class Verify:
+    """Check the manifest of a protocol: hash, counts, ranges, feasibility of a sample."""
+
+    name: Positional[str]
+    """Name of a released protocol, or a .toml file."""
+
+    def run(self) -> None:
+        from wbc_bench.errors import ManifestError
+        from wbc_bench.freeze import verify
+        from wbc_bench.manifest import manifest_path
+        from wbc_bench.protocol import find_protocol
+
+        protocol, path = find_protocol(self.name)
+        checks = verify(protocol, manifest_path(path))
+        for check in checks:
+            print(f"{'ok    ' if check.ok else 'FAILED'} {check.name}: {check.detail}")
+        failed = [check for check in checks if not check.ok]
+        if failed:
+            names = "; ".join(f"{check.name}: {check.detail}" for check in failed)
+            raise ManifestError(f"manifest of {protocol.name} does not hold what it promises: {names}")
+
+
+@dataclass(frozen=True)
+class Show:
+    """Print what a protocol asks for and draw its targets."""
+
+    name: Positional[str]
+    """Name of a released protocol, or a .toml file."""
+    out: Path = Path()
+    """Folder of the picture."""
+
+    def run(self) -> None:
+        import msgspec
+
+        from wbc_bench.manifest import manifest_path, read_manifest
+        from wbc_bench.plots import write_targets
+        from wbc_bench.protocol import find_protocol
+        from wbc_bench.publish import target_frame
+        from wbc_bench.store import ResultStore
+
+        protocol, path = find_protocol(self.name)
+        print(f"# digest {protocol.digest}")
+        print(msgspec.json.format(msgspec.json.encode(protocol), indent=2).decode())
+        manifest, sha256 = read_manifest(protocol, manifest_path(path))
+        print(f"# manifest sha256 {sha256}")
+        print(target_frame(manifest).groupby("stratum").describe().T.to_string())
+        ResultStore(self.out).probe()
+        for picture in write_targets(target_frame(manifest), protocol.name, self.out):
+            print(picture)
+
+
+@dataclass(frozen=True)
+class _Robot:
+    mount: str = ""
+    """Where the arm stands; the default of the facts file when not given."""
+    tcp: str = ""
+    """End-effector frame."""
+    ankle_effort: float | None = None
+    """Torque limit of the ankles [N m]."""
+
+    def _config(self) -> "RobotConfig":
+        from wbc_bench.robot import RobotConfig
+
+        return RobotConfig(mount=self.mount, tcp=self.tcp, ankle_effort=self.ankle_effort)
+
+
+@dataclass(frozen=True)
+class Export(_Robot):
+    """Write the robot as MuJoCo XML and as URDF."""
+
+    out: Path = tyro.MISSING
+    """Folder to write to."""
+
+    def run(self) -> None:
+        from wbc_bench.robot import build_spec, load_robot
+        from wbc_bench.store import ResultStore, write_atomic
+
+        robot = load_robot(self._config())
+        ResultStore(self.out).probe()
+        spec = build_spec(robot.facts, robot.config)
+        spec.compile()  # to_xml writes what was compiled
+        for suffix, text in (("xml", spec.to_xml()), ("urdf", robot.urdf())):
+            path = self.out / f"{robot.facts.name}.{suffix}"
+            write_atomic(path, text.encode())
+            print(path)
+
+
+@dataclass(frozen=True)
+class Picture(_Robot):
+    """Draw the robot in its default posture."""
+
+    out: Path = Path("robot.png")
+    """Picture to write."""
+
+    def run(self) -> None:
+        from wbc_bench.robot import load_robot
+        from wbc_bench.robot.picture import render
+        from wbc_bench.store import ResultStore
+
+        robot = load_robot(self._config())
+        ResultStore(self.out.parent).probe()
+        render(robot, self.out)
+        print(self.out)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Time what the installed packages offer to be timed, e.g. the solvers of the IK controller."""
+
+    names: Positional[tuple[str, ...]] = ()
+    """Benchmarks; all of them when not given."""
+    out: Path | None = None
+    """Also write <name>.csv and <name>.md into this folder."""
+
+    def run(self) -> None:
+        from importlib.metadata import entry_points
+
+        from wbc_bench.markup import Table
+        from wbc_bench.store import ResultStore
+
+        found = {point.name: point for point in entry_points(group=BENCHMARKS)}
+        for name in self.names:
+            if name not in found:
+                raise UnknownNameError("benchmark", name, found, f"entry points of '{BENCHMARKS}'")
+        if self.out:
+            ResultStore(self.out).probe()
+        for name in self.names or sorted(found):
+            frame = found[name].load()()
+            cells = [
+                tuple(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) for row in frame.values
+            ]
+            table = Table(name, f"Benchmark {name}", tuple(map(str, frame.columns)), tuple(cells), data=frame)
+            _print_table(table)
+            if self.out:
+                table.write(self.out)
+
+
+Command = (
+    Annotated[Ablation, subcommand("ablation")]
+    | Annotated[Reach, subcommand("reach")]
+    | Annotated[Eval, subcommand("eval")]
+    | Annotated[Compare, subcommand("compare")]
+    | Annotated[Report, subcommand("report")]
+    | Annotated[List, subcommand("list")]
+    | Annotated[
+        Annotated[Freeze, subcommand("freeze")]
+        | Annotated[Verify, subcommand("verify")]
+        | Annotated[Show, subcommand("show")],
+        subcommand("protocol", description="Freeze, verify or show a protocol."),
+    ]
+    | Annotated[
+        Annotated[Export, subcommand("export")] | Annotated[Picture, subcommand("show")],
+        subcommand("robot", description="Export or draw the robot."),
+    ]
+    | Annotated[Bench, subcommand("bench")]
+)
+
+
+def _at_least_one(option: str, value: int) -> None:
+    if value < 1:
+        raise UsageError(f"{option} {value}: valid: 1 or more")
+
+
+def _within(option: str, value: int | None, most: int, what: str) -> int:
+    if value is None:
+        return most
+    if not 1 <= value <= most:
+        raise UsageError(f"{option} {value}: valid: 1 to {most} ({what})")
+    return value
+
+
+def _print_table(table) -> None:
+    if sys.stdout.isatty():
+        from rich.console import Console
+
+        Console().print(table.rich())
+    else:
+        print(table.markdown())
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point; exits with 2 on a mistake of the user and with 130 when interrupted."""
+    os.environ.update(THREADS)
+    command = tyro.cli(
+        Command, prog="wbc-bench", description="Whole-body controllers on identical episodes.", args=arguments
+    )
+    try:
+        command.run()
+    except BenchError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except BrokenPipeError:  # the reader went away, e.g. `| head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except KeyboardInterrupt:
+        print("interrupted: finished shards are kept, the same command resumes", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,141 @@
+"""A table as text: Markdown, LaTeX (booktabs), CSV, HTML, terminal. The same table gives the same bytes."""
+
+import html
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+LONG = 30  # rows beyond which a page shows a table on demand
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text, the same numbers as a frame, and what a reader must know to read them."""
+
+    name: str  # of its files
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]  # a blank first cell continues the group above
+    notes: tuple[str, ...] = ()
+    data: pd.DataFrame = field(default_factory=pd.DataFrame)
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Columns that hold a number somewhere, and so align right."""
+        return [any(_is_number(row[k]) for row in self.rows) for k in range(len(self.header))]
+
+    def markdown(self) -> str:
+        def line(cells: Sequence[str]) -> str:
+            return "| " + " | ".join(cell.replace("|", "/") for cell in cells) + " |"
+
+        rule = ["---:" if number else "---" for number in self.numeric]
+        table = [line(self.header), line(rule), *map(line, self.rows)]
+        notes = ["", *(f"- {note}" for note in self.notes)] if self.notes else []
+        return "\n".join([f"## {self.title}", "", *table, *notes]) + "\n"
+
+    def latex(self) -> str:
+        body = []
+        for k, row in enumerate(self.rows):
+            if k and row[0]:
+                body.append(r"\midrule")
+            body.append(" & ".join(map(_latex, row)) + r" \\")
+        return "\n".join(
+            [
+                r"\begin{table*}[t]",
+                r"\centering",
+                rf"\caption{{{_latex(self.title)}}}",
+                rf"\label{{tab:{self.name}}}",
+                r"\footnotesize",
+                rf"\begin{{tabular}}{{{''.join('r' if number else 'l' for number in self.numeric)}}}",
+                r"\toprule",
+                " & ".join(rf"\textbf{{{_latex(cell)}}}" for cell in self.header) + r" \\",
+                r"\midrule",
+                *body,
+                r"\bottomrule",
+                r"\end{tabular}",
+                *(rf"\par\smallskip\raggedright {_latex(note)}" for note in self.notes),
+                r"\end{table*}",
+                "",
+            ]
+        )
+
+    def csv(self) -> str:
+        # Six digits: the last bits of a mean depend on the vector width of the processor.
+        return self.data.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+
+    def html(self) -> str:
+        """A <table> under its title, cells escaped; `code` marks as in Markdown."""
+
+        def text(cell: str) -> str:
+            return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(cell, quote=False))
+
+        def line(tag: str, cells: Sequence[str], kind: str = "") -> str:
+            classes = (' class="number"' if number else "" for number in self.numeric)
+            marked = (f"<{tag}{c}>{text(cell)}</{tag}>" for c, cell in zip(classes, cells, strict=True))
+            return f"<tr{kind}>{''.join(marked)}</tr>"
+
+        body = (line("td", row, ' class="group"' if row[0] else "") for row in self.rows)
+        notes = "".join(f"<li>{text(note)}</li>" for note in self.notes)
+        table = f'<div class="table"><table><thead>{line("th", self.header)}</thead>\n<tbody>'
+        table += "\n".join(body) + "</tbody></table></div>\n"
+        if len(self.rows) > LONG:
+            table = f"<details><summary>{len(self.rows)} rows</summary>{table}</details>\n"
+        return f"<h3>{text(self.title)}</h3>\n{table}" + (f"<ul>{notes}</ul>\n" if notes else "")
+
+    def rich(self) -> Any:
+        """For the terminal."""
+        from rich.table import Table as RichTable
+
+        table = RichTable(title=self.title, caption="\n".join(self.notes), caption_justify="left")
+        for name in self.header:
+            table.add_column(name)
+        for k, row in enumerate(self.rows):
+            table.add_row(*row, end_section=k + 1 < len(self.rows) and bool(self.rows[k + 1][0]))
+        return table
+
+    def write(self, out_dir: Path) -> list[Path]:
+        """Writes <out_dir>/<name>.md, .tex and .csv."""
+        out_dir.mkdir(parents=True, exist_ok=True)
+        paths = []
+        for suffix, text in (("md", self.markdown()), ("tex", self.latex()), ("csv", self.csv())):
+            path = out_dir / f"{self.name}.{suffix}"
+            path.write_text(text, encoding="utf-8", newline="\n")
+            paths.append(path)
+        return paths
+
+
+def read_markdown(path: Path) -> Table:
+    """The table that `Table.write` wrote as Markdown, without its frame."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    cells = [tuple(c.strip() for c in line.strip("|").split("|")) for line in lines if line.startswith("|")]
+    title = next((line.removeprefix("## ") for line in lines if line.startswith("## ")), path.stem)
+    notes = tuple(line.removeprefix("- ") for line in lines if line.startswith("- "))
+    return Table(path.stem, title, cells[0], tuple(cells[2:]), notes)
+
+
+def _is_number(cell: str) -> bool:
+    return bool(re.match(r"[+−-]?[\d<]", cell))
+
+
+LATEX = {
+    **{character: "\\" + character for character in "&%_#$"},
+    **{
+        "±": r"$\pm$",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
+        "Δ": r"$\Delta$",
+        "−": "$-$",
+        "–": "--",
+        "—": "---",
+    },
+    **{"†": r"$^\dagger$", "≥": r"$\geq$", "≤": r"$\leq$", "<": "$<$", ">": "$>$", "×": r"$\times$"},
+}
+
+
+def _latex(text: str) -> str:
+    text = re.sub(r"`([^`]*)`", lambda m: m[1], text)
+    return "".join(LATEX.get(character, character) for character in text)

@@ -1,0 +1,63 @@
+"""Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
+
+import tempfile
+from pathlib import Path
+
+import pandas as pd
+
+from wbc_bench import plots, report, tables
+from wbc_bench.errors import StoreError
+from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.protocol import PROTOCOL_DIR, ReachTargets, load_protocol, protocol_names
+from wbc_bench.store import ResultStore
+
+
+def publish(store: ResultStore, out: Path) -> list[Path]:
+    """Write <out>/tables, <out>/figures and <out>/report.html; equal records give equal bytes.
+
+    They are made in a folder of their own and moved when all of them are there.
+
+    Raises: StoreError when the store has no run, mixes digests, or the folder cannot be written.
+    """
+    protocols = sorted({run.record.protocol for run in store.runs()})
+    if not protocols:
+        raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
+            made = Path(folder)
+            for protocol in protocols:
+                _write_protocol(store, protocol, made)
+            report.write(store, made)
+            return [
+                _move(path, out / path.relative_to(made))
+                for path in sorted(made.rglob("*"))
+                if path.is_file()
+            ]
+    except OSError as error:
+        raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
+
+
+def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
+    """What a picture of a manifest's targets needs; metres."""
+    x, y, height = manifest.target_pos_w.T
+    return pd.DataFrame({"target_x": x, "target_y": y, "height": height, "stratum": manifest.stratum})
+
+
+def _write_protocol(store: ResultStore, name: str, out: Path) -> None:
+    released = load_protocol(PROTOCOL_DIR / f"{name}.toml") if name in protocol_names() else None
+    if released and isinstance(released.targets, ReachTargets):
+        tables.write_reach(store, name, out / "tables")
+        plots.write_reach(store, name, out / "figures")
+    else:
+        study = tables.ABLATION if name == tables.ABLATION.protocol else tables.Study(name, ())
+        tables.write_study(store, study, out / "tables")
+        plots.write_study(store, study, out / "figures")
+    if released:
+        manifest, _ = read_manifest(released, manifest_path(PROTOCOL_DIR / f"{name}.toml"))
+        plots.write_targets(target_frame(manifest), name, out / "figures")
+
+
+def _move(source: Path, destination: Path) -> Path:
+    destination.parent.mkdir(parents=True, exist_ok=True)
+    return source.replace(destination)

@@ -1,0 +1,151 @@
+"""report.html: every table and figure of a results folder and where each run came from, in one file.
+
+Self-contained: style and figures are inside, nothing is loaded. The same folder gives the same bytes.
+"""
+
+import base64
+import html
+from pathlib import Path
+from typing import Any
+
+from wbc_bench.analysis import StoreLike
+from wbc_bench.markup import read_markdown
+
+CSS = """
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-serif; color: #1c1c1c;
+  background: #fff; max-width: 1200px; margin: 0 auto; padding: 24px 28px 64px; }
+h1 { font-size: 26px; margin: 0 0 4px; }
+h2 { font-size: 20px; margin: 44px 0 8px; padding-bottom: 4px; border-bottom: 2px solid #0072b2; }
+h3 { font-size: 15px; margin: 28px 0 6px; }
+p.lead, nav { color: #555; }
+nav a { color: #0072b2; text-decoration: none; margin-right: 16px; }
+.table { overflow-x: auto; }
+table { border-collapse: collapse; font-size: 12px; border-top: 1.5px solid #1c1c1c;
+  border-bottom: 1.5px solid #1c1c1c; font-variant-numeric: tabular-nums; }
+th { text-align: left; max-width: 130px; vertical-align: bottom;
+  border-bottom: 1px solid #1c1c1c; font-weight: 600; }
+th, td { padding: 3px 7px; }
+td { white-space: nowrap; }
+td:first-child { font-weight: 600; }
+.number { text-align: right; }
+tr.group td { border-top: 1px solid #c9c9c9; }
+tbody tr:hover { background: #f3f7fa; }
+ul { font-size: 12.5px; color: #555; margin: 8px 0 0; padding-left: 18px; max-width: 960px; }
+code { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; }
+figure { margin: 20px 0; }
+figure img { max-width: 100%; height: auto; }
+figcaption { font-size: 12.5px; color: #555; }
+details { font-size: 12.5px; }
+summary { cursor: pointer; font-weight: 600; }
+.tag { color: #b34a00; font-weight: 600; }
+"""
+
+
+def figure_html(path: Path) -> str:
+    """An image as an <img> with its bytes inside; separate images, so that ids of two SVGs cannot meet."""
+    kind = {".svg": "svg+xml", ".png": "png"}[path.suffix]
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    caption = html.escape(path.stem)
+    return (
+        f'<figure><img alt="{caption}" src="data:image/{kind};base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>\n"
+    )
+
+
+def provenance_html(runs: list[Any]) -> str:
+    """One row a run, and under it the machines and versions that occur, each once."""
+    header = ("Protocol", "Controller", "Replicate", "Completed", "Protocol digest", "Manifest sha256")
+    header += ("Checkpoint", "Commit", "Created (UTC)", "Wall time (s)", "Workers", "Setup")
+    setups: dict[tuple[str, str], str] = {}
+    rows = []
+    for record in (run.record for run in runs):
+        key = (_pairs(record.machine), _pairs(record.versions))
+        setup = setups.setdefault(key, chr(ord("A") + len(setups)))
+        dirty = ' <span class="tag">+ uncommitted changes</span>' if record.git_dirty else ""
+        cells = (
+            *(html.escape(record.protocol), f"<code>{html.escape(record.controller)}</code>"),
+            *(str(record.replicate), f"{record.completed}/{record.requested}"),
+            *(_digest(record.protocol_digest), _digest(record.manifest_sha256)),
+            *(
+                _digest(record.checkpoint_sha256),
+                _digest(record.git_commit) + dirty,
+                html.escape(record.created),
+            ),
+            *(f"{record.wall_time_s:.1f}", str(record.workers), setup),
+        )
+        rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
+    head = "".join(f"<th>{name}</th>" for name in header)
+    table = f'<div class="table"><table><thead><tr>{head}</tr></thead>\n<tbody>' + "\n".join(rows)
+    details = "".join(
+        f"<li><b>Setup {name}</b>: {machine}<br>{versions}</li>\n"
+        for (machine, versions), name in setups.items()
+    )
+    return f"{table}</tbody></table></div>\n<ul>{details}</ul>\n"
+
+
+def _digest(value: str | None) -> str:
+    """The first twelve digits; the whole on hovering."""
+    return f'<code title="{html.escape(value)}">{html.escape(value[:12])}</code>' if value else "–"
+
+
+def _pairs(values: dict[str, Any]) -> str:
+    return html.escape(", ".join(f"{key} {values[key]}" for key in sorted(values)))
+
+
+def write(store: StoreLike, results_dir: Path | str) -> Path:
+    """Writes <results_dir>/report.html from its tables/*.md, its figures and the run records of the store."""
+    root = Path(results_dir)
+    tables = sorted((root / "tables").glob("*.md"))
+    figures = sorted({path.stem for path in (root / "figures").glob("*") if path.suffix in (".svg", ".png")})
+    runs = sorted(
+        store.runs(), key=lambda run: (run.record.protocol, run.record.controller, run.record.replicate)
+    )
+    # A section a protocol: its files begin with its name, and the longest such name owns a file.
+    protocols = sorted({run.record.protocol for run in runs})
+
+    def owner(stem: str) -> str:
+        return max((p for p in protocols if stem == p or stem.startswith(f"{p}_")), key=len, default="")
+
+    sections = []
+    for protocol in [*protocols, ""]:
+        own = sorted((path for path in tables if owner(path.stem) == protocol), key=_order)
+        shown = [read_markdown(path).html() for path in own]
+        images = [figure_html(_figure(root, stem)) for stem in figures if owner(stem) == protocol]
+        parts = [*shown[:1], *images, *shown[1:]]  # what most readers came for, first
+        if parts:
+            sections.append((protocol or "More", "".join(parts)))
+    sections.append(("Where the numbers come from", provenance_html(runs) if runs else "<p>No run yet.</p>"))
+    links = "".join(f'<a href="#s{k}">{html.escape(name)}</a>' for k, (name, _) in enumerate(sections))
+    body = "".join(
+        f'<h2 id="s{k}">{html.escape(name)}</h2>\n{part}' for k, (name, part) in enumerate(sections)
+    )
+    controllers = len({run.record.controller for run in runs})
+    episodes = sum(run.record.completed for run in runs)
+    lead = f"{episodes} episodes, {controllers} controllers, {len(protocols)} protocols"
+    path = root / "report.html"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>wbc-bench report</title>\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<style>{CSS}</style></head>\n<body><h1>wbc-bench report</h1>\n"
+        f'<p class="lead">{lead}. Every controller meets exactly the same episodes.</p>\n'
+        f"<nav>{links}</nav>\n{body}</body></html>\n",
+        encoding="utf-8",
+        newline="\n",
+    )
+    return path
+
+
+def _order(path: Path) -> tuple[int, str]:
+    """The main table of a protocol first, then from the general to the particular."""
+    suffixes = ("_all", "_outcomes", "_strata", "_pairs")
+    known = [k for k, suffix in enumerate(suffixes, 1) if path.stem.endswith(suffix)]
+    particular = "_vs_" in path.stem or "_heights_" in path.stem
+    return known[0] if known else len(suffixes) + 1 if particular else 0, path.stem
+
+
+def _figure(root: Path, stem: str) -> Path:
+    """The SVG where there is one."""
+    svg = root / "figures" / f"{stem}.svg"
+    return svg if svg.exists() else svg.with_suffix(".png")

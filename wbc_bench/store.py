@@ -1,0 +1,379 @@
+"""The results folder: one run record and one file of episodes a run, written atomically, shard by shard.
+
+    <root>/runs/<protocol>/<controller>/replicate_<k>/run.json, episodes.parquet
+                                                      shards/shard_00000.parquet ... while it runs
+
+The bytes of episodes.parquet are a function of protocol, controller and replicate alone: who computed
+which shard, when, and after how many interruptions stands only in run.json.
+"""
+
+import contextlib
+import fcntl
+import hashlib
+import os
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from wbc_bench.episodes import Outcome
+from wbc_bench.errors import StoreError, UnknownNameError
+
+LABELS = ("stratum", "condition", "orientation", "outcome")  # few values: dictionary-encoded
+
+
+class RunKey(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run is an answer to. Shards of different keys must not be merged."""
+
+    protocol: str
+    protocol_digest: str
+    manifest_sha256: str
+    controller: str  # the spec as it was given
+    replicate: int
+    requested: int  # episodes
+    shard_episodes: int
+    software_sha256: str  # all code that computes an episode, and its packages
+
+
+class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the episodes beside it come from."""
+
+    protocol: str
+    protocol_digest: str
+    manifest_sha256: str
+    controller: str
+    controller_name: str
+    signals: list[str]
+    source: str
+    replicate: int
+    requested: int
+    completed: int
+    episodes_sha256: str  # of episodes.parquet
+    checkpoint_sha256: str | None
+    outcomes: dict[str, int]  # name -> episodes; they add up to `completed`
+    software_sha256: str
+    git_commit: str | None
+    git_dirty: bool
+    versions: dict[str, str]
+    machine: dict[str, str | int | float]
+    shard_episodes: int
+    workers: int
+    engine: str
+    resumed_shards: int  # found from an earlier, interrupted session
+    wall_time_s: float  # [s] of the session that finished the run
+    compute_time_s: float  # [s] summed over shards
+    max_rss_mib: float  # [MiB] largest resident set of any worker
+    created: str  # UTC, ISO 8601
+
+
+class ShardCost(NamedTuple):
+    """What one shard took."""
+
+    seconds: float
+    max_rss_mib: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run."""
+
+    path: Path
+    record: RunRecord
+
+    def episodes(self) -> pd.DataFrame:
+        """One row an episode.
+
+        Raises: StoreError when the file is missing or not the one that the record was written for.
+        """
+        path = self.path / "episodes.parquet"
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise StoreError(f"cannot read '{path}': {error.strerror}") from error
+        sha256 = hashlib.sha256(data).hexdigest()
+        if sha256 != self.record.episodes_sha256:
+            raise StoreError(
+                f"'{path}' is not what its run.json was written for: sha256 {sha256[:16]}..., "
+                f"recorded {self.record.episodes_sha256[:16]}..."
+            )
+        return pq.read_table(pa.BufferReader(data)).to_pandas()
+
+
+class ResultStore:
+    """All runs under one folder."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+
+    def probe(self) -> None:
+        """Create the folder and write to it.
+
+        Raises: StoreError when that fails; permission bits alone do not tell (root, read-only mounts).
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(f"results folder '{self.root}' cannot be written: {error.strerror}") from error
+        probe = self.root / f".probe-{os.getpid()}"
+        write_atomic(probe, b"probe")
+        probe.unlink()
+
+    def runs(self, protocol: str | None = None) -> list[Run]:
+        """Finished runs, sorted by folder, i.e. protocol, controller, replicate."""
+        pattern = f"runs/{'*' if protocol is None else folder_name(protocol)}/*/replicate_*/run.json"
+        return [Run(path.parent, _read_record(path)) for path in sorted(self.root.glob(pattern))]
+
+    def load(self, protocol: str, controller: str) -> pd.DataFrame:
+        """Episodes of all replicates of a controller.
+
+        Raises:
+            UnknownNameError: it has no run.
+            StoreError: its replicates answer different protocols or manifests.
+        """
+        runs = [run for run in self.runs(protocol) if run.record.controller == controller]
+        if not runs:
+            known = {run.record.controller for run in self.runs(protocol)}
+            raise UnknownNameError("evaluated controller", controller, known, f"runs of {protocol}")
+        first = runs[0].record
+        for run in runs:
+            for name in ("protocol_digest", "manifest_sha256"):
+                if getattr(run.record, name) != getattr(first, name):
+                    raise StoreError(
+                        f"runs of '{controller}' under '{protocol}' must not be mixed: {name} is "
+                        f"{getattr(first, name)} in {runs[0].path.name}, "
+                        f"{getattr(run.record, name)} in {run.path.name}"
+                    )
+        return pd.concat([run.episodes() for run in runs], ignore_index=True)
+
+    def run_path(self, protocol: str, controller: str, replicate: int) -> Path:
+        """The folder of a run."""
+        folder = self.root / "runs" / folder_name(protocol) / folder_name(controller)
+        return folder / f"replicate_{replicate}"
+
+    def unfinished(self) -> list[tuple[Path, int]]:
+        """(folder, shards on disk) of runs that were interrupted."""
+        folders = sorted(self.root.glob("runs/*/*/replicate_*/shards"))
+        return [
+            (folder.parent, len(list(folder.glob("shard_*.parquet"))))
+            for folder in folders
+            if not (folder.parent / "run.json").exists()
+        ]
+
+
+class RunWriter:
+    """A run being written: which shards are missing, and the merge when none is.
+
+    One process at a time holds a run; the lock vanishes with the process, however it ends.
+    """
+
+    def __init__(self, store: ResultStore, key: RunKey, redo: bool = False) -> None:
+        """Raises: StoreError when the folder is in use, or holds another answer and `redo` is False."""
+        self.key = key
+        self.path = store.run_path(key.protocol, key.controller, key.replicate)
+        self._shards = self.path / "shards"
+        _make(self.path)
+        self._lock = _lock(self.path)
+        try:
+            for leftover in self.path.rglob(".*.tmp"):  # of a process that was killed while writing
+                leftover.unlink()
+            if redo:
+                _remove_files(self.path)
+            self.finished = self._finished()
+            if self.finished:
+                self._drop_shards()  # it may have been killed between the record and the clean-up
+                self.done: dict[int, ShardCost] = {}
+            else:
+                self.done = self._kept_shards()
+        except BaseException:
+            self.close()
+            raise
+        self.resumed = len(self.done)
+
+    @property
+    def num_shards(self) -> int:
+        return -(-self.key.requested // self.key.shard_episodes)
+
+    @property
+    def missing(self) -> list[int]:
+        """Numbers of the shards that are still to be computed."""
+        return [] if self.finished else [k for k in range(self.num_shards) if k not in self.done]
+
+    def rows(self, shard: int) -> range:
+        """Rows of the replicate that a shard holds."""
+        start = shard * self.key.shard_episodes
+        return range(start, min(start + self.key.shard_episodes, self.key.requested))
+
+    def write(self, shard: int, episodes: pa.Table, cost: ShardCost) -> None:
+        """Keep one shard: a file that is there is whole."""
+        _make(self._shards)
+        facts = {"key": msgspec.json.encode(self.key), "cost": msgspec.json.encode(cost)}
+        write_atomic(self._shard_path(shard), _parquet(episodes, facts, checksum=True))
+        self.done[shard] = cost
+
+    def finish(self, facts: Mapping[str, Any]) -> Run:
+        """Merge the shards, write the record, then remove the shards; `facts` completes the record."""
+        tables = [pq.read_table(self._shard_path(k)) for k in range(self.num_shards)]
+        episodes = pa.concat_tables([table.replace_schema_metadata() for table in tables]).combine_chunks()
+        key = self.key
+        identity = {name: str(getattr(key, name)) for name in ("protocol", "protocol_digest", "controller")}
+        data = _parquet(episodes, {**identity, "replicate": str(key.replicate)})
+        outcomes = episodes["outcome"].to_pylist()
+        record = RunRecord(
+            **msgspec.structs.asdict(key),
+            completed=len(episodes),
+            episodes_sha256=hashlib.sha256(data).hexdigest(),
+            outcomes={str(outcome): outcomes.count(str(outcome)) for outcome in Outcome},
+            resumed_shards=self.resumed,
+            compute_time_s=round(sum(cost.seconds for cost in self.done.values()), 3),
+            max_rss_mib=round(max(cost.max_rss_mib for cost in self.done.values()), 1),
+            **facts,
+        )
+        write_atomic(self.path / "episodes.parquet", data)
+        # The record comes last: a run without it is unfinished, whatever else is there.
+        write_atomic(
+            self.path / "run.json", msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
+        )
+        self._drop_shards()
+        self.finished = Run(self.path, record)
+        return self.finished
+
+    def close(self) -> None:
+        """Let go of the lock; remove the folder if nothing was written."""
+        with contextlib.suppress(OSError):
+            self._shards.rmdir()
+        with contextlib.suppress(OSError):
+            self.path.rmdir()
+        os.close(self._lock)
+
+    def _shard_path(self, shard: int) -> Path:
+        return self._shards / f"shard_{shard:05d}.parquet"
+
+    def _finished(self) -> Run | None:
+        path = self.path / "run.json"
+        if not path.exists():
+            return None
+        record = _read_record(path)
+        self._refuse_mixing(record, path, ignore={"software_sha256"})
+        return Run(self.path, record)
+
+    def _kept_shards(self) -> dict[int, ShardCost]:
+        """Whole shards of an earlier session; a damaged one is removed and computed again."""
+        kept = {}
+        for shard in range(self.num_shards):
+            path = self._shard_path(shard)
+            if not path.exists():
+                continue
+            try:
+                table = pq.read_table(path, page_checksum_verification=True)
+                facts = table.schema.metadata or {}
+                key = msgspec.json.decode(facts[b"key"], type=RunKey)
+                cost = msgspec.json.decode(facts[b"cost"], type=ShardCost)
+            except (OSError, KeyError, pa.ArrowException, msgspec.MsgspecError):
+                path.unlink()
+                continue
+            self._refuse_mixing(key, path)
+            if len(table) == len(self.rows(shard)):
+                kept[shard] = cost
+        return kept
+
+    def _refuse_mixing(self, other: RunKey | RunRecord, path: Path, ignore: Collection[str] = ()) -> None:
+        for name in self.key.__struct_fields__:
+            here, there = getattr(self.key, name), getattr(other, name)
+            if name not in ignore and here != there:
+                raise StoreError(
+                    f"'{path}' answers another question: {name} is {there}, asked for {here}; "
+                    "give another --out, or --redo to evaluate it again"
+                )
+
+    def _drop_shards(self) -> None:
+        if self._shards.exists():
+            _remove_files(self._shards)
+            self._shards.rmdir()
+
+
+def folder_name(name: str) -> str:
+    """A protocol or controller spec as a folder name."""
+    return "".join(c if c.isascii() and (c.isalnum() or c in "._@-") else "-" for c in name).strip("-.")
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write a file that is afterwards either whole or not there, even after a power cut.
+
+    Raises: StoreError when the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        with contextlib.suppress(OSError):  # where not even that is possible, it was never made
+            part.unlink()
+        raise StoreError(
+            f"cannot write '{path}': {error.strerror}; whatever was finished before is kept"
+        ) from error
+
+
+def _parquet(table: pa.Table, facts: Mapping[str, str | bytes], checksum: bool = False) -> bytes:
+    sink = pa.BufferOutputStream()
+    table = table.replace_schema_metadata(dict(facts))
+    pq.write_table(
+        table,
+        sink,
+        compression="zstd",
+        use_dictionary=[name for name in LABELS if name in table.column_names],  # pyright: ignore[reportArgumentType]
+        write_page_checksum=checksum,
+    )
+    return sink.getvalue().to_pybytes()
+
+
+def _read_record(path: Path) -> RunRecord:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=RunRecord)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise StoreError(f"cannot read run record '{path}': {error}") from error
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot create '{folder}': {error.strerror}") from error
+
+
+def _lock(folder: Path) -> int:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(descriptor)
+        raise StoreError(f"'{folder}' is being written by another process") from error
+    except OSError:
+        pass  # a file system without locks
+    return descriptor
+
+
+def _remove_files(folder: Path) -> None:
+    for path in _files(folder):
+        path.unlink()
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    # The record goes first: what is left of a half-removed run must not look finished.
+    yield from sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.name != "run.json")
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
