@@ -1,7 +1,29 @@
-from wbc_baselines.ik.controller import IKController
+"""`ik`: whole-body inverse kinematics over the floating base.
+
+Variants: `ik` (PlaCo), `ik:osqp` (the same program on Pinocchio and OSQP), `ik:kinematic` (PlaCo without
+feed-forward and feedback: what is left is the whole-body IK alone).
+"""
+
+from dataclasses import replace
+
+from wbc_bench.errors import UnknownNameError
+from wbc_bench.robot import Robot
+
+from wbc_baselines.ik.controller import PERIOD, IKController
 from wbc_baselines.ik.settings import TUNED
 
+VARIANTS = ("", "kinematic", "osqp")
 
-def make(robot, variant=""):
-    from wbc_baselines.ik.placo_ik import PlacoIK
-    return IKController(robot, PlacoIK(robot, TUNED.weights, 0.02), TUNED)
+
+def make(robot: Robot, variant: str = "") -> IKController:
+    """The controller of a variant. Raises: UnknownNameError."""
+    if variant not in VARIANTS:
+        raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
+    settings = replace(TUNED, feedforward=False, feedback=False) if variant == "kinematic" else TUNED
+    # imported here: each solver is needed only by its own variant
+    if variant == "osqp":
+        from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
+    else:
+        from wbc_baselines.ik.placo_ik import PlacoIK as Solver
+    name = f"ik:{variant}" if variant else "ik"
+    return IKController(robot, Solver(robot, settings.weights, PERIOD), settings, name)

@@ -44,72 +44,60 @@ class JointFilter:
 class GravityFilter:
     """Direction of gravity in the base frame: the gyro turns it, the measured direction corrects it.
 
+    The first measurements are averaged, since a single one is off by more than a degree.
+
     Source: complementary filter on the sphere, Mahony et al. 2008; the gain is the scalar Kalman gain.
     """
 
     def __init__(self, period: float, gravity_noise: float, gyro_noise: float) -> None:
         self._period = period
         one = np.eye(1)
+        self._noise = np.sqrt(uniform_variance(gravity_noise))
         q = uniform_variance(gyro_noise) * period**2 + 1e-7
         self._gain = kalman_gain(one, one, q * one, uniform_variance(gravity_noise) * one + 1e-12).item()
 
     def reset(self, gravity: Array) -> None:
         """Start at measured directions (N, 3)."""
         self.gravity = gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
+        self._count = 1
+        self.deviation = self._noise  # [rad] of the direction
 
     def update(self, gravity: Array, ang_vel_b: Array) -> None:
         """Take in measured directions (N, 3) and gyro rates (N, 3) [rad/s]."""
         pred = self.gravity - self._period * np.cross(ang_vel_b, self.gravity)
-        pred = pred + self._gain * (gravity - pred)
+        self._count += 1
+        gain = max(self._gain, 1 / self._count)
+        self.deviation = self._noise * np.sqrt(gain)
+        pred = pred + gain * (gravity - pred)
         self.gravity = pred / np.linalg.norm(pred, axis=1, keepdims=True)
 
 
 class ComFilter:
-    """Position, velocity and disturbance acceleration of the centre of mass of one robot, a Kalman filter.
+    """Position and velocity of the centre of mass of one robot, a Kalman filter.
 
-    Between steps the mass follows the planned contact force plus a slowly varying disturbance (an unknown mass,
-    gains that are not the nominal ones). An innovation that the noise cannot explain is taken for a push and
-    opens the filter to a jump of the velocity.
+    Between steps the mass follows the planned contact force. An innovation that the noise cannot explain is
+    taken for a push and opens the filter to a jump of the velocity.
     """
 
-    def __init__(
-        self, period: float, pos_noise: float, acceleration: float, drift: float, jump: float, threshold: float, pos: Array
-    ) -> None:
-        self._a = np.array([[1.0, period, period**2 / 2], [0.0, 1.0, period], [0.0, 0.0, 1.0]])
-        self._b = self._a[:, 2].copy()
-        self._b[2] = 0.0
+    def __init__(self, period: float, pos_noise: float, acceleration: float, jump: float, pos: Array) -> None:
+        self._a = np.array([[1.0, period], [0.0, 1.0]])
+        self._b = np.array([period**2 / 2, period])
         self._process = acceleration**2 * np.outer(self._b, self._b)
-        self._process[2, 2] = drift**2 * period
-        self._measurement = pos_noise**2
-        direction = np.array([period, 1.0, 0.0])
-        self._jump = jump**2 * np.outer(direction, direction)
-        self.threshold = threshold
-        self._state = np.zeros((3, 3))
-        self._state[0] = pos
-        self._cov = np.diag([self._measurement, jump**2, drift**2])
+        self._joint_variance = pos_noise**2
+        self._jump = jump**2 * np.outer([period, 1.0], [period, 1.0])
+        self.pos, self.vel = pos.copy(), np.zeros(3)  # (3,) [m], (3,) [m/s]
+        self._cov = np.diag([0.03**2, 0.2**2])  # [m^2], [m^2/s^2] at a disturbed reset
 
-    @property
-    def pos(self) -> Array:
-        """(3,) [m]"""
-        return self._state[0]
-
-    @property
-    def vel(self) -> Array:
-        """(3,) [m/s]"""
-        return self._state[1]
-
-    @property
-    def disturbance(self) -> Array:
-        """(3,) [m/s^2]"""
-        return self._state[2]
-
-    def update(self, pos: Array, acceleration: Array) -> None:
-        """Take in a measured position (3,) [m] after a step with a planned acceleration (3,) [m/s^2]."""
-        state = self._a @ self._state + self._b[:, None] * acceleration
-        cov = self._a @ self._cov @ self._a.T + self._process
-        innovation = pos - state[0]
-        if innovation @ innovation > self.threshold**2 * 3 * (cov[0, 0] + self._measurement):  # three sigma
+    def update(self, pos: Array, acceleration: Array, tilt: float) -> None:
+        """Take in a position (3,) [m], seen with a tilt error [rad], after a planned acceleration (3,) [m/s^2]."""
+        a, b = self._a, self._b
+        pred = self.pos + a[0, 1] * self.vel + b[0] * acceleration
+        vel = self.vel + b[1] * acceleration
+        cov = a @ self._cov @ a.T + self._process
+        noise = self._joint_variance + (tilt * pos[2]) ** 2
+        innovation = pos - pred
+        if innovation @ innovation > 3.0**2 * 3 * (cov[0, 0] + noise):  # three sigma, three axes
             cov = cov + self._jump
-        gain = cov[:, 0] / (cov[0, 0] + self._measurement)
-        self._state = state + gain[:, None] * innovation
+        gain = cov[:, 0] / (cov[0, 0] + noise)
+        self.pos, self.vel = pred + gain[0] * innovation, vel + gain[1] * innovation
         self._cov = cov - gain[:, None] * cov[0]

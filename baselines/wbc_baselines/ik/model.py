@@ -34,6 +34,13 @@ class WholeBodyModel:
         pin.framesForwardKinematics(self.model, self.data, self._q)
         return [self.pose(sole) for sole in self.soles]
 
+    def arm_in_base(self, joints: Array) -> tuple[Pose, Array]:
+        """End-effector pose in the base frame, and its Jacobian (6, 6) by the arm joints, base-aligned."""
+        self._q[7:] = joints
+        pin.computeJointJacobians(self.model, self.data, self._q)
+        pin.updateFramePlacement(self.model, self.data, self.tcp)
+        return self.pose(self.tcp), self.jacobian(self.tcp)[:, 14:]
+
     def update(self, q: Array) -> None:
         """Kinematics, Jacobians and centre of mass at q."""
         pin.computeJointJacobians(self.model, self.data, q)

@@ -1,6 +1,11 @@
 """The whole-body inverse kinematics as one quadratic program, in PlaCo."""
 
 import contextlib
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import placo
@@ -11,6 +16,8 @@ from wbc_baselines.ik.model import Pose
 from wbc_baselines.ik.settings import Weights
 
 Array = NDArray[np.float64]
+ARM_LINKS = ("arm_link3", "arm_link5", "arm_link6")
+BODY_LINKS = ("base_Link", "hip_L_Link", "knee_L_Link", "hip_R_Link", "knee_R_Link")
 
 
 class PlacoIK:
@@ -20,8 +27,7 @@ class PlacoIK:
     """
 
     def __init__(self, robot: Robot, weights: Weights, period: float) -> None:
-        with _quiet():
-            self._robot = wrapper = placo.RobotWrapper("", placo.Flags.ignore_collisions, robot.urdf())
+        self._robot = wrapper = _load(robot)
         margin = weights.joint_margin
         for name, lower, upper, speed in zip(JOINT_NAMES, robot.lower, robot.upper, robot.velocity, strict=True):
             wrapper.set_joint_limits(name, lower + margin, upper - margin)
@@ -29,11 +35,13 @@ class PlacoIK:
         self._solver = solver = wrapper.make_solver()
         solver.dt = period
         solver.enable_joint_limits(True)
-        self._ee = solver.add_frame_task("tcp", np.eye(4))
-        self._ee.configure("ee", "soft", weights.ee_position, weights.ee_orientation)
+        ee = solver.add_frame_task("tcp", np.eye(4))
+        ee.configure("ee", "soft", weights.ee_position, weights.ee_orientation)
+        self._ee = ee.position(), ee.orientation()
         # Two 6-D foot constraints have rank 10 of 12 on these 4-DoF legs: the right foot gives up roll and yaw.
-        self._left = solver.add_frame_task("sole_L", np.eye(4))
-        self._left.configure("left", "hard", 1.0, 1.0)
+        left = solver.add_frame_task("sole_L", np.eye(4))
+        left.configure("left", "hard", 1.0, 1.0)
+        self._left = left.position(), left.orientation()
         self._right = solver.add_position_task("sole_R", np.zeros(3))
         self._right.configure("right", "hard", 1.0)
         self._pitch = solver.add_orientation_task("sole_R", np.eye(3))
@@ -41,13 +49,19 @@ class PlacoIK:
         self._pitch.mask.set_axises("y", "local")
         self._flat = solver.add_orientation_task("sole_R", np.eye(3))
         self._flat.configure("right_flat", "soft", weights.foot_flat)
-        self._com = solver.add_com_task(np.zeros(3))
+        self._centre = np.zeros(3)
+        self._com = solver.add_com_task(self._centre)
         self._com.mask.set_axises("xy")
         self._com.configure("com", "soft", weights.com)
         self._polygon = solver.add_com_polygon_constraint([np.zeros(2)] * 3, weights.com_margin)
         self._polygon.configure("polygon", "hard")
+        collisions = solver.add_avoid_self_collisions_constraint()
+        collisions.configure("collisions", "soft", weights.collision)
+        collisions.self_collisions_margin = weights.collision_margin
+        collisions.self_collisions_trigger = weights.collision_trigger
+        upright = solver.add_orientation_task("base_Link", np.eye(3))
+        upright.configure("upright", "soft", weights.upright)
         self._posture = solver.add_joints_task()
-        self._posture.configure("posture", "soft", weights.posture)
         solver.add_regularization_task(weights.regularization)
 
     def step(
@@ -57,30 +71,33 @@ class PlacoIK:
         soles: list[Pose],
         hull: Array,
         posture: Array,
+        posture_weight: float,
         limit_speed: bool = True,
     ) -> Array | None:
         """The configuration (21,) one step on, or None when the program has no solution.
 
         q: (21,) configuration to start from; ee, soles: poses asked for; hull: (V, 2) support polygon,
-        counter-clockwise; posture: (14,) joint positions preferred. All in the anchor frame.
+        counter-clockwise; posture: (14,) joint positions preferred, by a weight. All in the anchor frame.
         """
         robot, solver = self._robot, self._solver
         robot.state.q = q
         robot.update_kinematics()
-        self._ee.T_world_frame = _matrix(ee)
-        self._left.T_world_frame = _matrix(soles[0])
+        for (position, orientation), (pos, rot) in ((self._ee, ee), (self._left, soles[0])):
+            position.target_world, orientation.R_world_frame = pos, rot
         self._right.target_world = soles[1][0]
         self._pitch.R_world_frame = soles[1][1]
         self._flat.R_world_frame = soles[1][1]
-        self._com.target_world = np.array([*hull.mean(axis=0), 0.0])
+        self._centre[:2] = np.add.reduce(hull) / len(hull)  # np.mean takes four times as long
+        self._com.target_world = self._centre
         self._polygon.polygon = list(hull[::-1])  # PlaCo wants it clockwise
-        self._posture.set_joints(dict(zip(JOINT_NAMES, posture, strict=True)))
+        self._posture.set_joints(dict(zip(JOINT_NAMES, posture.tolist(), strict=True)))
+        self._posture.configure("posture", "soft", posture_weight)
         solver.enable_velocity_limits(limit_speed)
         try:
             solver.solve(True)
         except RuntimeError:
             return None
-        return np.array(robot.state.q)
+        return robot.state.q.copy()
 
 
 def _matrix(pose: Pose) -> Array:
@@ -89,5 +106,26 @@ def _matrix(pose: Pose) -> Array:
     return matrix
 
 
-def _quiet():
-    return contextlib.nullcontext()
+def _load(robot: Robot) -> placo.RobotWrapper:
+    """The robot with the pairs of parts that can meet: forearm, wrist and gripper with base and legs."""
+    with tempfile.TemporaryDirectory() as folder, _quiet_stdout(Path(folder) / "log"):
+        wrapper = placo.RobotWrapper("", 0, robot.urdf())
+        pairs = [[arm, body] for arm in ARM_LINKS for body in BODY_LINKS]
+        file = Path(folder) / "pairs.json"
+        file.write_text(json.dumps(pairs))
+        wrapper.load_collision_pairs(str(file))
+    return wrapper
+
+
+@contextlib.contextmanager
+def _quiet_stdout(log: Path):
+    """PlaCo prints the overlaps of neighbouring parts from C++: send that stream to a file meanwhile."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)

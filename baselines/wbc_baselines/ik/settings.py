@@ -1,4 +1,4 @@
-"""Every constant of the IK controller. Tuned on `tuning_*` manifests that no table uses (see README.md here)."""
+"""Every constant of the IK controller. Tuned on the `tuning_*` manifests, which no table uses; see README.md."""
 
 from dataclasses import dataclass, field
 
@@ -9,18 +9,23 @@ class Weights:
 
     ee_position: float = 1.0
     ee_orientation: float = 0.3
-    com: float = 0.3  # horizontal centring, beside the polygon that must not be left
-    posture: float = 1e-3
+    com: float = 1.0  # horizontal centring over the soles, beside the polygon that must not be left
+    upright: float = 1e-3  # of the base
+    posture: float = 1e-3  # towards the planned posture, on the way
+    planning_posture: float = 1e-4  # towards a start, while planning: small, for it pulls the hand off its target
     foot_flat: float = 0.1  # roll and yaw of the right sole, which the hard constraints leave free
-    regularization: float = 1e-5
+    regularization: float = 1e-3  # below this the program takes steps of a radian near singular legs
     joint_margin: float = 0.02  # [rad] kept from the joint limits
     speed_fraction: float = 0.5  # of the joint speed limits
-    com_margin: float = 0.045  # [m] of the centre of mass inside the soles' hull
+    collision: float = 1e3
+    collision_margin: float = 0.01  # [m]
+    collision_trigger: float = 0.04  # [m]
+    com_margin: float = 0.04  # [m] of the centre of mass inside the soles' hull
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Of the controller around it."""
+    """Of the controller around the program."""
 
     weights: Weights = field(default_factory=Weights)
     # the way of the target
@@ -31,33 +36,37 @@ class Settings:
     settle: float = 0.3  # [s] of standing still before the target moves
     target_filter: float = 0.3  # [s]
     stance_filter: float = 0.5  # [s]
-    ee_integral: float = 0.3  # [1/s] on the measured error of the hand
-    ee_integral_limit: float = 0.08  # [m, rad]
+    # the hand
+    hand_blend: float = 1.5  # [s] before arrival, within one second, the hand's servo takes over
+    hand_damping: float = 0.05  # of the arm's inverse kinematics near singular postures
+    hand_limit: float = 0.5  # [rad] an arm joint may leave the whole-body solution
+    hand_integral: float = 0.3  # [1/s] on the measured error of the hand
+    hand_integral_limit: float = 0.08  # [m, rad]
     # balance
-    feedforward: bool = True
-    feedback: bool = True
-    kp_com: float = 15.0  # [1/s^2]
-    kd_com: float = 7.5  # [1/s]
+    feedforward: bool = True  # torques that carry the weight, sent as torque / kp
+    feedback: bool = True  # of centre of mass, base orientation and hand
+    kp_com: float = 15.0  # [1/s^2] about omega^2 = g / h
+    kd_com: float = 7.5  # [1/s] about 2 omega
     kp_rot: float = 60.0  # [1/s^2]
     kd_rot: float = 15.0  # [1/s]
-    height_gain: float = 1.0  # vertical over horizontal gains
-    rejection: float = 1.0  # part of the estimated disturbance that is compensated
-    ki_rot: float = 30.0  # [1/s^3]
+    ki_rot: float = 30.0  # [1/s^3] against an unknown mass and gains that are not the nominal ones
     rot_integral_limit: float = 10.0  # [rad/s^2]
     inertia: float = 1.5  # [kg m^2] of the upper body about its centre
-    moment_weight: float = 3.0  # [1/m] of moment errors over force errors
+    roll_weight: float = 3.0  # [1/m] of moment errors over force errors
+    pitch_weight: float = 3.0
     yaw_weight: float = 0.2
     damping: float = 0.02  # on the contact forces
-    compliance: float = 0.8  # part of the legs' posture stiffness that is taken away
+    compliance: float = 0.5  # part of the legs' posture stiffness that is taken away
     friction: float = 0.4  # the lowest of the protocol's range
-    sole_x: float = 1.0  # parts of the sole used for the contact forces
-    sole_y: float = 0.7
-    # estimation
+    sole_width: float = 0.7  # part of the sole's width that carries contact forces
+    # estimation; noise half-widths are those of the paper's lineage, see the protocols
+    gyro_noise: float = 0.2  # [rad/s]
+    gravity_noise: float = 0.05
+    joint_pos_noise: float = 0.01  # [rad]
+    joint_vel_noise: float = 1.5  # [rad/s]
     joint_acceleration: float = 10.0  # [rad/s^2] process noise of a joint
-    com_noise: float = 0.005  # [m] of the centre of mass from joint noise
+    com_noise: float = 0.003  # [m] of the centre of mass from joint noise
     com_acceleration: float = 1.0  # [m/s^2] process noise of the centre of mass
-    com_drift: float = 1.0  # [m/s^2/sqrt(s)] of the disturbance
-    com_threshold: float = 3.0
     com_jump: float = 0.3  # [m/s] a push
 
 
