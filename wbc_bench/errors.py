@@ -12,10 +12,14 @@ class UnknownNameError(BenchError):
     """A name that is not in a list of valid ones, with the nearest of them."""
 
     def __init__(self, kind: str, name: str, valid: Iterable[str], where: str) -> None:
-        names = sorted(valid)
+        self._arguments = (kind, name, tuple(valid), where)
+        names = sorted(self._arguments[2])
         near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         super().__init__(f"unknown {kind} '{name}' ({where}): {hint}valid: {', '.join(names) or 'none'}")
+
+    def __reduce__(self):
+        return type(self), self._arguments  # so that it crosses from a worker process
 
 
 class ProtocolError(BenchError):

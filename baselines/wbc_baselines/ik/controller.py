@@ -122,9 +122,10 @@ class IKController:
                 )
                 reference.set_goal(e.q[7:].copy(), goal)
             reference.advance()
+        weight = s.weights.standing_posture if reference.goal is None else s.weights.posture
         # the measured stance may be far from the reference: the first step must be free to jump there
         q = self._solver.step(
-            e.q, reference.ee, soles, e.hull, reference.posture, s.weights.posture, limit_speed=e.step > 1
+            e.q, reference.ee, soles, e.hull, reference.posture, weight, limit_speed=e.step > 1
         )
         if q is None:
             return False

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from wbc_baselines.ik.model import Pose, WholeBodyModel
+from wbc_baselines.ik.placo_ik import ARM_LINKS, BODY_LINKS
 from wbc_baselines.ik.settings import Weights
 from wbc_bench.robot import Robot
 
@@ -37,16 +38,21 @@ class Row(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Minimise 1/2 dq^T P dq + c^T dq under A dq = b, G dq <= h and lower <= dq <= upper."""
+    """Minimise 1/2 dq^T P dq + c^T dq + weight / 2 |s|^2 under A dq = b, G dq <= h, lower <= dq <= upper.
+
+    The last S inequalities are soft: they may be exceeded by slacks s >= 0.
+    """
 
     p: Array  # (20, 20)
     c: Array  # (20,)
     a: Array  # (10, 20)
     b: Array  # (10,)
-    g: Array  # (V, 20)
-    h: Array  # (V,) [m]
+    g: Array  # (V + S, 20) of V edges of the polygon and S pairs of bodies
+    h: Array  # (V + S,) [m]
     lower: Array  # (20,)
     upper: Array  # (20,)
+    soft: int  # S
+    weight: float
 
 
 class OsqpIK:
@@ -57,6 +63,8 @@ class OsqpIK:
 
     def __init__(self, robot: Robot, weights: Weights, period: float) -> None:
         self._model = WholeBodyModel(robot)
+        self._clearance = Clearance(robot, self._model, weights.collision_trigger)
+        self._base = self._model.model.getFrameId("base_Link")
         self._weights = weights
         self._lower = robot.lower + weights.joint_margin  # (14,) [rad]
         self._upper = robot.upper - weights.joint_margin
@@ -70,21 +78,29 @@ class OsqpIK:
         soles: list[Pose],
         hull: Array,
         posture: Array,
+        posture_weight: float,
         limit_speed: bool = True,
     ) -> Array | None:
         """The configuration (21,) one step on, or None when the program has no solution.
 
         q: (21,) configuration to start from; ee, soles: poses asked for; hull: (V, 2) support polygon,
-        counter-clockwise; posture: (14,) joint positions preferred. All in the anchor frame.
+        counter-clockwise; posture: (14,) joint positions preferred, by a weight. All in the anchor frame.
         """
-        program = self.program(q, ee, soles, hull, posture, limit_speed)
+        program = self.program(q, ee, soles, hull, posture, posture_weight, limit_speed)
         if (program.lower > program.upper).any():  # OSQP takes crossed bounds for a malformed problem
             return None
         dq = solve(program)
         return None if dq is None else pin.integrate(self._model.model, q, dq)
 
     def program(
-        self, q: Array, ee: Pose, soles: list[Pose], hull: Array, posture: Array, limit_speed: bool = True
+        self,
+        q: Array,
+        ee: Pose,
+        soles: list[Pose],
+        hull: Array,
+        posture: Array,
+        posture_weight: float,
+        limit_speed: bool = True,
     ) -> Program:
         """The quadratic program of one step; arguments as of `step`.
 
@@ -101,7 +117,8 @@ class OsqpIK:
             (weights.ee_orientation, self.orientation(model.tcp, ee[1])),
             (weights.foot_flat, self.orientation(right, soles[1][1])),
             (weights.com, Row(com_jacobian, hull.mean(axis=0) - com_pos)),
-            (weights.posture, Row(self._select, posture - q[7:])),
+            (weights.upright, self.orientation(self._base, np.eye(3))),
+            (posture_weight, Row(self._select, posture - q[7:])),
             (weights.regularization, Row(self._select, np.zeros(len(posture)))),
         ]
         # Two hard 6-D feet have rank 10 of 12 on these 4-DoF legs: the right one gives up roll and yaw.
@@ -114,6 +131,7 @@ class OsqpIK:
             Row(axis[None] @ turning.jacobian, axis[None] @ turning.error),
         ]
         normal, offset = half_planes(hull)
+        closing, room = self._clearance.rows()
         lower = np.full(model.model.nv, -np.inf)
         upper = np.full(model.model.nv, np.inf)
         lower[BASE:], upper[BASE:] = self._lower - q[7:], self._upper - q[7:]
@@ -127,10 +145,14 @@ class OsqpIK:
             c=-jacobian.T @ error,
             a=np.concatenate([row.jacobian for row in hard]),
             b=np.concatenate([row.error for row in hard]),
-            g=normal @ com_jacobian,
-            h=offset - weights.com_margin - normal @ com_pos,
+            g=np.concatenate([normal @ com_jacobian, closing]),
+            h=np.concatenate(
+                [offset - weights.com_margin - normal @ com_pos, room - weights.collision_margin]
+            ),
             lower=lower,
             upper=upper,
+            soft=len(room),
+            weight=weights.collision,
         )
 
     def position(self, frame: int, target: Array) -> Row:
@@ -143,6 +165,42 @@ class OsqpIK:
         return Row(self._model.jacobian(frame)[3:], pin.log3(target @ rot.T))
 
 
+class Clearance:
+    """Distances between the parts of the robot that can meet: those that `placo_ik` keeps apart."""
+
+    def __init__(self, robot: Robot, model: WholeBodyModel, trigger: float) -> None:
+        self._model, self._trigger = model, trigger
+        self._geometry = geometry = pin.buildGeomFromUrdfString(model.model, robot.urdf(), pin.COLLISION)
+        links = [model.model.frames[part.parentFrame].name for part in geometry.geometryObjects]
+        self._joints = [part.parentJoint for part in geometry.geometryObjects]
+        arms = [i for i, link in enumerate(links) if link in ARM_LINKS]
+        bodies = [i for i, link in enumerate(links) if link in BODY_LINKS]
+        self._pairs = [(arm, body) for arm in arms for body in bodies]
+        for pair in self._pairs:
+            geometry.addCollisionPair(pin.CollisionPair(*pair))
+        self._data = pin.GeometryData(geometry)
+
+    def rows(self) -> tuple[Array, Array]:
+        """After an update of the model: how fast each near pair closes (S, 20) [m/rad], and its distance (S,) [m]."""
+        model, data = self._model.model, self._model.data
+        pin.updateGeometryPlacements(model, data, self._geometry, self._data)
+        pin.computeDistances(self._geometry, self._data)
+        rows, distances = [], []
+        for pair, result in zip(self._pairs, self._data.distanceResults, strict=True):
+            if result.min_distance < self._trigger:
+                normal = result.normal  # from the first to the second, through both nearest points
+                row = np.zeros(model.nv)
+                for sign, i, point in (
+                    (1, pair[0], result.getNearestPoint1()),
+                    (-1, pair[1], result.getNearestPoint2()),
+                ):
+                    jacobian = pin.getJointJacobian(model, data, self._joints[i], pin.WORLD)
+                    row += sign * np.concatenate([normal, np.cross(point, normal)]) @ jacobian
+                rows.append(row)
+                distances.append(result.min_distance)
+        return np.array(rows).reshape(-1, model.nv), np.array(distances)
+
+
 def half_planes(hull: Array) -> tuple[Array, Array]:
     """Outward unit normals (V, 2) and offsets (V,) [m] of a counter-clockwise polygon: normal x <= offset."""
     edge = np.roll(hull, -1, axis=0) - hull
@@ -152,17 +210,27 @@ def half_planes(hull: Array) -> tuple[Array, Array]:
 
 def solve(program: Program) -> Array | None:
     """The minimiser (20,), or None when OSQP does not find one."""
+    n, soft = len(program.c), program.soft
+    p = np.zeros((n + soft, n + soft))
+    p[:n, :n] = np.triu(program.p)
+    p[n:, n:] = program.weight * np.eye(soft)
+    g = np.zeros((len(program.h), n + soft))
+    g[:, :n] = program.g
+    g[len(g) - soft :, n:] = -np.eye(soft)
+    a = np.zeros((len(program.b), n + soft))
+    a[:, :n] = program.a
+    slack = np.zeros(soft)
     problem = qpsolvers.Problem(
-        P=sparse.csc_matrix(np.triu(program.p)),
-        q=program.c,
-        G=sparse.csc_matrix(program.g),
+        P=sparse.csc_matrix(p),
+        q=np.concatenate([program.c, slack]),
+        G=sparse.csc_matrix(g),
         h=program.h,
-        A=sparse.csc_matrix(program.a),
+        A=sparse.csc_matrix(a),
         b=program.b,
-        lb=program.lower,
-        ub=program.upper,
+        lb=np.concatenate([program.lower, slack]),
+        ub=np.concatenate([program.upper, slack + np.inf]),
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # qpsolvers warns of what `found` says already
         solution = qpsolvers.solve_problem(problem, solver="osqp", **OPTIONS)
-    return solution.x if solution.found else None
+    return solution.x[:n] if solution.found else None

@@ -29,7 +29,9 @@ class PlacoIK:
     def __init__(self, robot: Robot, weights: Weights, period: float) -> None:
         self._robot = wrapper = _load(robot)
         margin = weights.joint_margin
-        for name, lower, upper, speed in zip(JOINT_NAMES, robot.lower, robot.upper, robot.velocity, strict=True):
+        for name, lower, upper, speed in zip(
+            JOINT_NAMES, robot.lower, robot.upper, robot.velocity, strict=True
+        ):
             wrapper.set_joint_limits(name, lower + margin, upper - margin)
             wrapper.set_velocity_limit(name, weights.speed_fraction * speed)
         self._solver = solver = wrapper.make_solver()

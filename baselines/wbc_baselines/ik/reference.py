@@ -18,6 +18,8 @@ SEEDS = (
     (0.0, 0.0, -1.0, 1.5, 1.5),
 )
 
+MAX_LEAN = 1.0  # [rad]
+
 
 class Reference:
     """Slewed target of one episode in the anchor frame, and the joint posture that goes with it."""
@@ -86,6 +88,8 @@ def plan(
             trial = step
         pos, rot = model.ee_of(trial)
         error = norm(pos - target[0]) + 0.3 * norm(pin.log3(rot.T @ target[1]))
+        # a base that leans this far is about to be counted as fallen
+        error += max(0.0, float(np.arccos(np.clip(upright(trial), -1.0, 1.0))) - MAX_LEAN)
         if error < best_error:
             best, best_error = trial, error
         if error < 0.01:
@@ -103,6 +107,12 @@ def seeds(default: Array) -> list[Array]:
         q[8:11] = j1, j2, j3
         postures.append(q)
     return postures
+
+
+def upright(q: Array) -> float:
+    """Cosine of the angle between the base's and the world's vertical at a configuration (21,)."""
+    x, y = q[3], q[4]
+    return 1.0 - 2.0 * (x * x + y * y)
 
 
 def norm(vector: Array) -> float:

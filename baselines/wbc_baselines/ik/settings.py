@@ -11,8 +11,11 @@ class Weights:
     ee_orientation: float = 0.3
     com: float = 1.0  # horizontal centring over the soles, beside the polygon that must not be left
     upright: float = 1e-3  # of the base
-    posture: float = 1e-3  # towards the planned posture, on the way
-    planning_posture: float = 1e-4  # towards a start, while planning: small, for it pulls the hand off its target
+    standing_posture: float = 1e-3  # towards the default posture, before the hand moves
+    posture: float = 1e-2  # towards the planned posture, on the way
+    planning_posture: float = (
+        1e-4  # towards a start, while planning: small, for it pulls the hand off its target
+    )
     foot_flat: float = 0.1  # roll and yaw of the right sole, which the hard constraints leave free
     regularization: float = 1e-3  # below this the program takes steps of a radian near singular legs
     joint_margin: float = 0.02  # [rad] kept from the joint limits

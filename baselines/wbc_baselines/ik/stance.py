@@ -17,7 +17,10 @@ class Stance(NamedTuple):
 
     def poses(self) -> list[tuple[Array, Array]]:
         """Position (3,) and rotation (3, 3) of each sole, flat on the ground."""
-        return [(np.array([xy[0], xy[1], 0.0]), yaw_matrix(yaw)) for xy, yaw in zip(self.xy, self.yaw, strict=True)]
+        return [
+            (np.array([xy[0], xy[1], 0.0]), yaw_matrix(yaw))
+            for xy, yaw in zip(self.xy, self.yaw, strict=True)
+        ]
 
     def toward(self, other: "Stance", fraction: float) -> "Stance":
         """A step from this stance to another."""
@@ -38,7 +41,8 @@ def yaw_matrix(yaw: float) -> Array:
 def measured_stance(soles: list[tuple[Array, Array]]) -> Stance:
     """The flat stance nearest to two sole poses."""
     return Stance(
-        np.array([pos[:2] for pos, _ in soles]), np.array([np.arctan2(rot[1, 0], rot[0, 0]) for _, rot in soles])
+        np.array([pos[:2] for pos, _ in soles]),
+        np.array([np.arctan2(rot[1, 0], rot[0, 0]) for _, rot in soles]),
     )
 
 
@@ -53,7 +57,9 @@ def base_from_stance(
     line = soles_b[0][0] - soles_b[1][0]
     y = line - up_b * (up_b @ line)
     y /= np.sqrt(y @ y)
-    x = np.array([y[1] * up_b[2] - y[2] * up_b[1], y[2] * up_b[0] - y[0] * up_b[2], y[0] * up_b[1] - y[1] * up_b[0]])
+    x = np.array(
+        [y[1] * up_b[2] - y[2] * up_b[1], y[2] * up_b[0] - y[0] * up_b[2], y[0] * up_b[1] - y[1] * up_b[0]]
+    )
     level = np.stack([x, y, up_b])  # base to a level frame along the line
     if stance is None:
         heading = level @ (soles_b[0][1][:, 0] + soles_b[1][1][:, 0])
