@@ -10,7 +10,7 @@ STRATA = ("arm", "posture", "step")
 
 
 class Outcome(enum.StrEnum):
-    """How an episode ended; every episode has exactly one, so that counts add up to the episodes asked for."""
+    """How an episode ended; each has exactly one, so that counts add up to the episodes asked for."""
 
     SUCCESS = "success"  # both errors inside the tolerance at every step of the final window
     FELL = "fell"  # the base tilted or sank past the termination limits

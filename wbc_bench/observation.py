@@ -34,8 +34,8 @@ _WIDTHS = {  # signals with noise, in the order of their columns
 class Sensors:
     """Turns true states of N episodes into observations.
 
-    Noise is uniform and is drawn for a whole episode at once from the episode's own stream, so that it depends
-    neither on the batch nor on when another episode ends. Source: paper, section III-A (uniform noise).
+    Noise is uniform and is drawn for a whole episode at once from the episode's own stream, so that it
+    depends neither on the batch nor on when another episode ends. Source: paper, section III-A.
     """
 
     def __init__(self, protocol: EvalProtocol, rows: EpisodeManifest, signals: frozenset[Signal]) -> None:

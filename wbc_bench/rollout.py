@@ -98,7 +98,7 @@ def evaluate(controller: Controller, protocol: EvalProtocol, rows: EpisodeManife
 
 
 def _terminations(protocol: EvalProtocol, state: State) -> list[tuple[Outcome, NDArray[np.bool_]]]:
-    """Ways an episode ends early, the first that holds counts. Source: paper's termination, made deterministic."""
+    """Ways an episode ends early; the first that holds counts. Source: the paper, made deterministic."""
     limits = protocol.termination
     tilted = state.base_rot_w[:, 2, 2] < np.cos(limits.tilt)
     low = state.base_pos_w[:, 2] < limits.base_height

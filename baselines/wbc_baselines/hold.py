@@ -2,6 +2,7 @@
 
 import numpy as np
 from numpy.typing import NDArray
+
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.robot import Robot

@@ -6,11 +6,10 @@ feed-forward and feedback: what is left is the whole-body IK alone).
 
 from dataclasses import replace
 
-from wbc_bench.errors import UnknownNameError
-from wbc_bench.robot import Robot
-
 from wbc_baselines.ik.controller import PERIOD, IKController
 from wbc_baselines.ik.settings import TUNED
+from wbc_bench.errors import UnknownNameError
+from wbc_bench.robot import Robot
 
 VARIANTS = ("", "kinematic", "osqp")
 

@@ -1,7 +1,8 @@
 """Solve time of one step of whole-body IK: PlaCo and OSQP beside Pink and mink, on one and the same problem.
 
 Pink and mink ship neither a support polygon nor a foot constraint without roll and yaw; both are added here
-through their public interfaces, as a limit and a task, so that all solve the program of `placo_ik`.
+through their public interfaces, as a limit and a task. What keeps arm and body apart is soft in `placo_ik` and
+hard in these two, whose limits have no slack; otherwise all solve the same program.
 """
 
 import time
@@ -16,8 +17,8 @@ import qpsolvers
 from numpy.typing import NDArray
 
 from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
-from wbc_baselines.ik.osqp_ik import OsqpIK, half_planes
-from wbc_baselines.ik.placo_ik import PlacoIK
+from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK, half_planes
+from wbc_baselines.ik.placo_ik import ARM_LINKS, BODY_LINKS, PlacoIK
 from wbc_baselines.ik.settings import TUNED, Weights
 from wbc_baselines.ik.stance import base_from_stance, measured_stance
 from wbc_bench.manifest import manifest_path, read_manifest
@@ -27,7 +28,7 @@ from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
 
 Array = NDArray[np.float64]
 PERIOD = 0.02  # [s]
-SLEW = 35  # steps until the target has arrived, as in IKController.plan
+SLEW = 35  # steps until the target has arrived, as in `reference.plan`
 POSITION_AND_PITCH = [0, 1, 2, 4]  # of a foot's twist in its own frame
 QP_SOLVERS = ("daqp", "quadprog", "proxqp", "osqp")  # for Pink and mink: the fastest here first
 
@@ -75,7 +76,8 @@ class Ours:
 
     def step(self, q: Array, ee: Pose) -> Array | None:
         scene = self._scene
-        return self._ik.step(q, ee, scene.soles, scene.hull, scene.robot.default_q)
+        default, weight = scene.robot.default_q, scene.weights.posture
+        return self._ik.step(q, ee, scene.soles, scene.hull, default, weight)
 
 
 def make_placo(scene: Scene) -> Solver:
@@ -99,6 +101,7 @@ def make_pink(scene: Scene) -> Solver:
     model.velocityLimit[:6] = np.inf
     model.velocityLimit[6:] = weights.speed_fraction * robot.velocity
     normal, offset = half_planes(scene.hull)
+    clearance = Clearance(robot, model, weights.collision_trigger)
 
     class PositionPitchTask(FrameTask):
         def compute_error(self, configuration):
@@ -113,6 +116,11 @@ def make_pink(scene: Scene) -> Solver:
             room = offset - weights.com_margin - normal @ configuration.data.com[0][:2]
             return normal @ jacobian, room
 
+    class ClearanceLimit(Limit):
+        def compute_qp_inequalities(self, configuration, dt):
+            closing, distance = clearance.rows(configuration.data)
+            return (closing, distance - weights.collision_margin) if len(distance) else None
+
     class Pink:
         package, qp = "pin-pink", _qp_solver()
 
@@ -121,14 +129,21 @@ def make_pink(scene: Scene) -> Solver:
             self._ee = FrameTask("tcp", np.sqrt(weights.ee_position), np.sqrt(weights.ee_orientation))
             left, right = FrameTask("sole_L", 1.0, 1.0), PositionPitchTask("sole_R", 1.0, 1.0)
             flat = FrameTask("sole_R", 0.0, np.sqrt(weights.foot_flat))
+            upright = FrameTask("base_Link", 0.0, np.sqrt(weights.upright))
+            upright.set_target(pin.SE3.Identity())
             com = ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
             posture = PostureTask(float(np.sqrt(weights.posture)))
             for task, (pos, rot) in zip((left, right, flat), [*scene.soles, scene.soles[1]], strict=True):
                 task.set_target(pin.SE3(rot, pos))
             com.set_target(np.array([*scene.hull.mean(axis=0), 0.0]))
             posture.set_target(scene.q)
-            self._tasks, self._hard = [self._ee, flat, com, posture], [left, right]
-            self._limits = [ConfigurationLimit(model, 1.0), VelocityLimit(model), PolygonLimit()]
+            self._tasks, self._hard = [self._ee, flat, upright, com, posture], [left, right]
+            self._limits = [
+                ConfigurationLimit(model, 1.0),
+                VelocityLimit(model),
+                PolygonLimit(),
+                ClearanceLimit(),
+            ]
 
         def start(self, q: Array) -> Array:
             return q
@@ -189,18 +204,27 @@ def make_mink(scene: Scene) -> Solver:
             left = mink.FrameTask("sole_L", "site", 1.0, 1.0)
             right = PositionPitchTask("sole_R", "site", 1.0, 1.0)
             flat = mink.FrameTask("sole_R", "site", 0.0, np.sqrt(weights.foot_flat))
+            upright = mink.FrameTask("base_Link", "body", 0.0, np.sqrt(weights.upright))
+            upright.set_target(mink.SE3.identity())
             com = mink.ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
             posture = mink.PostureTask(model, float(np.sqrt(weights.posture)))
             for task, pose in zip((left, right, flat), [*scene.soles, scene.soles[1]], strict=True):
                 task.set_target(_se3(pose))
             com.set_target(np.array([*scene.hull.mean(axis=0), 0.0]))
             posture.set_target(self.start(scene.q))
-            self._tasks, self._hard = [self._ee, flat, com, posture], [left, right]
+            self._tasks, self._hard = [self._ee, flat, upright, com, posture], [left, right]
             speed = weights.speed_fraction * robot.velocity
             self._limits = [
                 mink.ConfigurationLimit(model, 1.0, weights.joint_margin),
                 mink.VelocityLimit(model, dict(zip(JOINT_NAMES, speed, strict=True))),
                 PolygonLimit(),
+                mink.CollisionAvoidanceLimit(
+                    model,
+                    [(_geoms(ARM_LINKS), _geoms(BODY_LINKS))],
+                    gain=1.0,
+                    minimum_distance_from_collisions=weights.collision_margin,
+                    collision_detection_distance=weights.collision_trigger,
+                ),
             ]
 
         def start(self, q: Array) -> Array:
@@ -225,6 +249,10 @@ def make_mink(scene: Scene) -> Solver:
             except mink.NoSolutionFound:
                 return None
             return self._configuration.integrate(velocity, PERIOD)
+
+    def _geoms(bodies: tuple[str, ...]) -> list[int]:
+        ids = [model.body(body).id for body in bodies]
+        return np.flatnonzero(np.isin(model.geom_bodyid, ids)).tolist()
 
     def _se3(pose: Pose):
         return mink.SE3(np.concatenate([wxyz_from_matrix(pose[1]), pose[0]]))

@@ -3,8 +3,6 @@
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
-from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
 from wbc_baselines.ik.balance import distribute, friction_rays
 from wbc_baselines.ik.estimation import ComFilter, GravityFilter, JointFilter
@@ -13,6 +11,8 @@ from wbc_baselines.ik.model import GRAVITY, Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.reference import Reference, plan
 from wbc_baselines.ik.settings import Settings
 from wbc_baselines.ik.stance import Stance, base_from_stance, measured_stance
+from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
+from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
 Array = NDArray[np.float64]
 PERIOD = 0.02  # [s]

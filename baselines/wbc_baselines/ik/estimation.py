@@ -19,7 +19,7 @@ def kalman_gain(a: Array, c: Array, process: Array, measurement: Array) -> Array
 
 
 class JointFilter:
-    """Joint positions and velocities of N robots: a steady-state Kalman filter, constant velocity between steps."""
+    """Joint positions and velocities of N robots: a steady-state Kalman filter with constant velocity."""
 
     def __init__(self, period: float, pos_noise: float, vel_noise: float, acceleration: float) -> None:
         self._period = period
@@ -89,7 +89,7 @@ class ComFilter:
         self._cov = np.diag([0.03**2, 0.2**2])  # [m^2], [m^2/s^2] at a disturbed reset
 
     def update(self, pos: Array, acceleration: Array, tilt: float) -> None:
-        """Take in a position (3,) [m], seen with a tilt error [rad], after a planned acceleration (3,) [m/s^2]."""
+        """Take in a position (3,) [m], seen with a tilt error [rad], after an acceleration (3,) [m/s^2]."""
         a, b = self._a, self._b
         pred = self.pos + a[0, 1] * self.vel + b[0] * acceleration
         vel = self.vel + b[1] * acceleration

@@ -12,7 +12,8 @@ Array = NDArray[np.float64]
 def solve_arm(model: WholeBodyModel, joints: Array, pose_b: Pose, damping: float, limit: float) -> Array:
     """Arm joints (6,) [rad] near those of `joints` (14,) that put the hand at a pose in the base frame.
 
-    Two damped Gauss-Newton steps; no joint moves further than `limit` [rad]. Source: Nakamura & Hanafusa 1986.
+    Two damped Gauss-Newton steps; no joint moves further than `limit` [rad].
+    Source: Nakamura & Hanafusa 1986 (damped least squares).
     """
     start = joints[8:]
     trial = joints.copy()

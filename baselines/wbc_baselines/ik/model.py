@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+
 from wbc_bench.robot import JOINT_NAMES, Robot
 
 Array = NDArray[np.float64]

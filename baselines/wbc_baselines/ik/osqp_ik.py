@@ -1,9 +1,11 @@
 """The quadratic program of `placo_ik`, written out on Pinocchio Jacobians and solved with OSQP."""
 
+import functools
 import warnings
 from typing import NamedTuple
 
 import numpy as np
+import osqp
 import pinocchio as pin
 import qpsolvers
 from numpy.typing import NDArray
@@ -12,11 +14,13 @@ from scipy import sparse
 from wbc_baselines.ik.model import Pose, WholeBodyModel
 from wbc_baselines.ik.placo_ik import ARM_LINKS, BODY_LINKS
 from wbc_baselines.ik.settings import Weights
-from wbc_bench.robot import Robot
+from wbc_bench.robot import NUM_JOINTS, Robot
 
 Array = NDArray[np.float64]
 BASE = 6  # tangent coordinates of the free base, before those of the joints
 
+# Otherwise every solve looks for OSQP's builds on CUDA and MKL first, and would take them where there are any.
+osqp.interface.OSQP_ALGEBRA_BACKEND = "builtin"
 # Close enough for the active set to be right; polishing then solves it to machine precision. rho adapts by
 # iterations, not by the clock, which would make the answer depend on the load of the machine.
 OPTIONS = {
@@ -38,9 +42,9 @@ class Row(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Minimise 1/2 dq^T P dq + c^T dq + weight / 2 |s|^2 under A dq = b, G dq <= h, lower <= dq <= upper.
+    """Minimise 1/2 dq^T P dq + c^T dq under A dq = b, G dq <= h and bounds on the joints.
 
-    The last S inequalities are soft: they may be exceeded by slacks s >= 0.
+    The last S inequalities are soft: they may be exceeded by s, which costs weight / 2 |s|^2.
     """
 
     p: Array  # (20, 20)
@@ -49,8 +53,8 @@ class Program(NamedTuple):
     b: Array  # (10,)
     g: Array  # (V + S, 20) of V edges of the polygon and S pairs of bodies
     h: Array  # (V + S,) [m]
-    lower: Array  # (20,)
-    upper: Array  # (20,)
+    lower: Array  # (14,) [rad]
+    upper: Array  # (14,) [rad]
     soft: int  # S
     weight: float
 
@@ -63,7 +67,7 @@ class OsqpIK:
 
     def __init__(self, robot: Robot, weights: Weights, period: float) -> None:
         self._model = WholeBodyModel(robot)
-        self._clearance = Clearance(robot, self._model, weights.collision_trigger)
+        self._clearance = Clearance(robot, self._model.model, weights.collision_trigger)
         self._base = self._model.model.getFrameId("base_Link")
         self._weights = weights
         self._lower = robot.lower + weights.joint_margin  # (14,) [rad]
@@ -131,13 +135,10 @@ class OsqpIK:
             Row(axis[None] @ turning.jacobian, axis[None] @ turning.error),
         ]
         normal, offset = half_planes(hull)
-        closing, room = self._clearance.rows()
-        lower = np.full(model.model.nv, -np.inf)
-        upper = np.full(model.model.nv, np.inf)
-        lower[BASE:], upper[BASE:] = self._lower - q[7:], self._upper - q[7:]
+        closing, room = self._clearance.rows(model.data)
+        lower, upper = self._lower - q[7:], self._upper - q[7:]
         if limit_speed:
-            lower[BASE:] = np.maximum(lower[BASE:], -self._stride)
-            upper[BASE:] = np.minimum(upper[BASE:], self._stride)
+            lower, upper = np.maximum(lower, -self._stride), np.minimum(upper, self._stride)
         jacobian = np.concatenate([np.sqrt(weight) * row.jacobian for weight, row in soft])
         error = np.concatenate([np.sqrt(weight) * row.error for weight, row in soft])
         return Program(
@@ -168,10 +169,10 @@ class OsqpIK:
 class Clearance:
     """Distances between the parts of the robot that can meet: those that `placo_ik` keeps apart."""
 
-    def __init__(self, robot: Robot, model: WholeBodyModel, trigger: float) -> None:
+    def __init__(self, robot: Robot, model: pin.Model, trigger: float) -> None:
         self._model, self._trigger = model, trigger
-        self._geometry = geometry = pin.buildGeomFromUrdfString(model.model, robot.urdf(), pin.COLLISION)
-        links = [model.model.frames[part.parentFrame].name for part in geometry.geometryObjects]
+        self._geometry = geometry = pin.buildGeomFromUrdfString(model, robot.urdf(), pin.COLLISION)
+        links = [model.frames[part.parentFrame].name for part in geometry.geometryObjects]
         self._joints = [part.parentJoint for part in geometry.geometryObjects]
         arms = [i for i, link in enumerate(links) if link in ARM_LINKS]
         bodies = [i for i, link in enumerate(links) if link in BODY_LINKS]
@@ -180,9 +181,12 @@ class Clearance:
             geometry.addCollisionPair(pin.CollisionPair(*pair))
         self._data = pin.GeometryData(geometry)
 
-    def rows(self) -> tuple[Array, Array]:
-        """After an update of the model: how fast each near pair closes (S, 20) [m/rad], and its distance (S,) [m]."""
-        model, data = self._model.model, self._model.data
+    def rows(self, data: pin.Data) -> tuple[Array, Array]:
+        """Of each pair nearer than the trigger: how fast it closes (S, 20), and its distance (S,) [m].
+
+        data: after `computeJointJacobians`.
+        """
+        model = self._model
         pin.updateGeometryPlacements(model, data, self._geometry, self._data)
         pin.computeDistances(self._geometry, self._data)
         rows, distances = [], []
@@ -211,26 +215,55 @@ def half_planes(hull: Array) -> tuple[Array, Array]:
 def solve(program: Program) -> Array | None:
     """The minimiser (20,), or None when OSQP does not find one."""
     n, soft = len(program.c), program.soft
+    joints = np.eye(n)[BASE:]
     p = np.zeros((n + soft, n + soft))
-    p[:n, :n] = np.triu(program.p)
-    p[n:, n:] = program.weight * np.eye(soft)
-    g = np.zeros((len(program.h), n + soft))
-    g[:, :n] = program.g
-    g[len(g) - soft :, n:] = -np.eye(soft)
+    p[:n, :n] = program.p
+    p[range(n, n + soft), range(n, n + soft)] = program.weight
+    # the bounds as rows: qpsolvers takes longer to stack them below than OSQP to solve them
+    g = np.zeros((len(program.h) + 2 * len(joints), n + soft))
+    g[:, :n] = np.concatenate([joints, -joints, program.g])
+    g[len(g) - soft :, n:] = -np.eye(soft)  # no s < 0: it would cost more than 0 and gain nothing
     a = np.zeros((len(program.b), n + soft))
     a[:, :n] = program.a
-    slack = np.zeros(soft)
+    patterns = _patterns(len(program.b), len(program.h) - soft, soft)
     problem = qpsolvers.Problem(
-        P=sparse.csc_matrix(p),
-        q=np.concatenate([program.c, slack]),
-        G=sparse.csc_matrix(g),
-        h=program.h,
-        A=sparse.csc_matrix(a),
+        P=_csc(p, patterns[0]),
+        q=np.concatenate([program.c, np.zeros(soft)]),
+        G=_csc(g, patterns[1]),
+        h=np.concatenate([program.upper, -program.lower, program.h]),
+        A=_csc(a, patterns[2]),
         b=program.b,
-        lb=np.concatenate([program.lower, slack]),
-        ub=np.concatenate([program.upper, slack + np.inf]),
     )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # qpsolvers warns of what `found` says already
         solution = qpsolvers.solve_problem(problem, solver="osqp", **OPTIONS)
     return solution.x[:n] if solution.found else None
+
+
+class Pattern(NamedTuple):
+    """The entries of a matrix that can differ from zero. SciPy's search for them takes as long as the solution."""
+
+    matrix: sparse.csc_matrix
+    transposed: NDArray[np.bool_]
+
+
+def _csc(dense: Array, pattern: Pattern) -> sparse.csc_matrix:
+    matrix = pattern.matrix.copy()
+    matrix.data = dense.T[pattern.transposed]
+    return matrix
+
+
+@functools.cache
+def _patterns(equalities: int, edges: int, soft: int) -> list[Pattern]:
+    """Of the upper triangle of P, of G and of A in `solve`."""
+    n = BASE + NUM_JOINTS
+    joints = np.eye(n)[BASE:]
+    slack = np.zeros((2 * NUM_JOINTS + edges + soft, soft))
+    slack[len(slack) - soft :] = np.eye(soft)
+    rows = np.concatenate([joints, joints, np.ones((edges + soft, n))])
+    p = np.zeros((n + soft, n + soft))
+    p[:n, :n] = np.triu(np.ones((n, n)))
+    p[n:, n:] = np.eye(soft)
+    a = np.concatenate([np.ones((equalities, n)), np.zeros((equalities, soft))], axis=1)
+    masks = p, np.concatenate([rows, slack], axis=1), a
+    return [Pattern(sparse.csc_matrix(mask), mask.T > 0) for mask in masks]

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import placo
 from numpy.typing import NDArray
-from wbc_bench.robot import JOINT_NAMES, Robot
 
 from wbc_baselines.ik.model import Pose
 from wbc_baselines.ik.settings import Weights
+from wbc_bench.robot import JOINT_NAMES, Robot
 
 Array = NDArray[np.float64]
 ARM_LINKS = ("arm_link3", "arm_link5", "arm_link6")
@@ -40,7 +40,7 @@ class PlacoIK:
         ee = solver.add_frame_task("tcp", np.eye(4))
         ee.configure("ee", "soft", weights.ee_position, weights.ee_orientation)
         self._ee = ee.position(), ee.orientation()
-        # Two 6-D foot constraints have rank 10 of 12 on these 4-DoF legs: the right foot gives up roll and yaw.
+        # Two 6-D foot constraints have rank 10 of 12 on 4-DoF legs: the right foot gives up roll and yaw.
         left = solver.add_frame_task("sole_L", np.eye(4))
         left.configure("left", "hard", 1.0, 1.0)
         self._left = left.position(), left.orientation()
@@ -53,7 +53,7 @@ class PlacoIK:
         self._flat.configure("right_flat", "soft", weights.foot_flat)
         self._centre = np.zeros(3)
         self._com = solver.add_com_task(self._centre)
-        self._com.mask.set_axises("xy")
+        self._com.mask.set_axises("xy")  # pyright: ignore[reportCallIssue]  (the stub lacks the default)
         self._com.configure("com", "soft", weights.com)
         self._polygon = solver.add_com_polygon_constraint([np.zeros(2)] * 3, weights.com_margin)
         self._polygon.configure("polygon", "hard")
@@ -110,7 +110,7 @@ def _matrix(pose: Pose) -> Array:
 
 def _load(robot: Robot) -> placo.RobotWrapper:
     """The robot with the pairs of parts that can meet: forearm, wrist and gripper with base and legs."""
-    with tempfile.TemporaryDirectory() as folder, _quiet_stdout(Path(folder) / "log"):
+    with tempfile.TemporaryDirectory() as folder, _quiet(Path(folder) / "log"):
         wrapper = placo.RobotWrapper("", 0, robot.urdf())
         pairs = [[arm, body] for arm in ARM_LINKS for body in BODY_LINKS]
         file = Path(folder) / "pairs.json"
@@ -120,14 +120,17 @@ def _load(robot: Robot) -> placo.RobotWrapper:
 
 
 @contextlib.contextmanager
-def _quiet_stdout(log: Path):
-    """PlaCo prints the overlaps of neighbouring parts from C++: send that stream to a file meanwhile."""
+def _quiet(log: Path):
+    """PlaCo prints the overlaps of neighbouring parts from C++: send its streams to a file meanwhile."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    streams = (1, 2)
+    kept = [os.dup(stream) for stream in streams]
     with log.open("w") as file:
-        os.dup2(file.fileno(), 1)
+        for stream in streams:
+            os.dup2(file.fileno(), stream)
         try:
             yield
         finally:
-            os.dup2(kept, 1)
-            os.close(kept)
+            for stream, copy in zip(streams, kept, strict=True):
+                os.dup2(copy, stream)
+                os.close(copy)

@@ -1,4 +1,7 @@
-"""Every constant of the IK controller. Tuned on the `tuning_*` manifests, which no table uses; see README.md."""
+"""Every constant of the IK controller.
+
+Tuned on the `tuning_*` protocols, which no table uses; the tuning and its budget are in baselines/README.md.
+"""
 
 from dataclasses import dataclass, field
 
