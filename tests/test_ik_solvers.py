@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
-from wbc_baselines.ik.osqp_ik import OsqpIK, half_planes
+from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK, half_planes
 from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import Weights
 from wbc_baselines.ik.stance import base_from_stance, measured_stance
@@ -20,6 +20,7 @@ from wbc_bench.rotations import matrix_from_wxyz
 PERIOD = 0.02  # [s]
 # damped enough for a full Gauss-Newton step to come to rest beside the singularities of wrist and knees
 WEIGHTS = Weights(regularization=1e-3)
+POSTURE = WEIGHTS.planning_posture
 ROBOT = load_robot()
 SOLVERS = {"placo": PlacoIK(ROBOT, WEIGHTS, PERIOD), "osqp": OsqpIK(ROBOT, WEIGHTS, PERIOD)}
 MODEL = WholeBodyModel(ROBOT)
@@ -66,7 +67,7 @@ def _slew(target: Pose, steps: int = 70, limit_speed: bool = True) -> dict[str, 
         for k in range(steps):
             part = min(1.0, (k + 1) / 35)
             ee = START.ee[0] + part * way, START.ee[1] @ pin.exp3(part * turning)
-            q = solver.step(path[-1], ee, START.soles, START.hull, ROBOT.default_q, limit_speed)
+            q = solver.step(path[-1], ee, START.soles, START.hull, ROBOT.default_q, POSTURE, limit_speed)
             assert q is not None, f"{name}: no solution at step {k}"
             path.append(q)
         paths[name] = np.array(path)
@@ -89,9 +90,8 @@ def test_both_solvers_take_the_same_steps(paths):
     """OSQP from where PlaCo stands, so that differences do not add up along the way."""
     for path, target in zip(paths, _targets(12), strict=True):
         for q in path["placo"][::14]:
-            steps = [
-                s.step(q, target, START.soles, START.hull, ROBOT.default_q, False) for s in SOLVERS.values()
-            ]
+            program = target, START.soles, START.hull, ROBOT.default_q, POSTURE, False
+            steps = [s.step(q, *program) for s in SOLVERS.values()]
             # 1e-8, PlaCo's own damping on the base, is all that differs
             np.testing.assert_allclose(steps[1], steps[0], atol=1e-5)
 
@@ -138,7 +138,7 @@ def test_contradiction_has_no_solution(name):
     left, (pos, rot) = START.soles
     for distance, limit_speed in ((1.5, False), (0.3, True)):
         soles = [left, (pos + np.array([distance, 0.0, 0.0]), rot)]
-        step = SOLVERS[name].step(START.q, START.ee, soles, START.hull, ROBOT.default_q, limit_speed)
+        step = SOLVERS[name].step(START.q, START.ee, soles, START.hull, ROBOT.default_q, POSTURE, limit_speed)
         assert step is None
 
 
@@ -146,7 +146,7 @@ def test_contradiction_has_no_solution(name):
 def test_joint_beyond_what_its_speed_allows_has_no_solution(name):
     q = START.q.copy()
     q[-1] = ROBOT.upper[-1] + 1.0  # [rad]
-    assert SOLVERS[name].step(q, START.ee, START.soles, START.hull, ROBOT.default_q, True) is None
+    assert SOLVERS[name].step(q, START.ee, START.soles, START.hull, ROBOT.default_q, POSTURE, True) is None
 
 
 def _random_case(rng: np.random.Generator):
@@ -167,13 +167,15 @@ def _cost(q, ee, soles, posture) -> float:
     pos, rot = MODEL.pose(MODEL.tcp)
     com = MODEL.data.com[0][:2]
     flat = MODEL.pose(MODEL.soles[1])[1]
+    base = MODEL.pose(MODEL.model.getFrameId("base_Link"))[1]
     w = WEIGHTS
     return 0.5 * (
         w.ee_position * np.sum((pos - ee[0]) ** 2)
         + w.ee_orientation * np.sum(pin.log3(rot.T @ ee[1]) ** 2)
         + w.foot_flat * np.sum(pin.log3(flat.T @ soles[1][1]) ** 2)
         + w.com * np.sum((com - START.hull.mean(axis=0)) ** 2)
-        + w.posture * np.sum((q[7:] - posture) ** 2)
+        + w.upright * np.sum(pin.log3(base) ** 2)
+        + POSTURE * np.sum((q[7:] - posture) ** 2)
     )
 
 
@@ -183,7 +185,7 @@ def test_gradient_of_the_program_is_that_of_its_cost():
     h = 1e-6
     for _ in range(5):
         q, ee, soles, posture = _random_case(rng)
-        program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture)
+        program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture, POSTURE)
         slope = [
             (
                 _cost(pin.integrate(MODEL.model, q, d), ee, soles, posture)
@@ -205,16 +207,79 @@ def test_rows_are_derivatives_of_their_errors():
         soles = [MODEL.pose(sole) for sole in MODEL.soles]
 
         def errors(q, ee=ee, soles=soles, posture=posture):
-            program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture)
-            return np.concatenate([program.b, program.h])
+            program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture, POSTURE)
+            return np.concatenate([program.b, program.h[: len(program.h) - program.soft]])
 
-        program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture)
-        rows = np.concatenate([program.a, program.g])
+        program = SOLVERS["osqp"].program(q, ee, soles, START.hull, posture, POSTURE)
+        rows = np.concatenate([program.a, program.g[: len(program.g) - program.soft]])
         slope = [
             (errors(pin.integrate(MODEL.model, q, d)) - errors(pin.integrate(MODEL.model, q, -d))) / (2 * h)
             for d in h * np.eye(MODEL.model.nv)
         ]
         np.testing.assert_allclose(-rows.T, slope, atol=1e-8)
+
+
+HUGGING = [  # [m] from the base's place on the ground: under the arm's mount, beside the base, at a knee
+    (0.15, 0.0, 0.75),
+    (0.1, 0.2, 0.55),
+    (0.2, -0.1, 0.6),
+    (0.0, -0.2, 0.7),
+]
+BESIDE = np.array([*START.q[:2], 0.0])
+
+
+@pytest.fixture(scope="module")
+def hugging() -> list[np.ndarray]:
+    """PlaCo's way, (61, 21), to hand positions inside or close to base and legs."""
+    paths = []
+    rot = START.ee[1] @ pin.exp3(np.array([0.0, 1.0, 0.0]))
+    for place in HUGGING:
+        pos, path = np.array(place) + BESIDE, [START.q]
+        for k in range(60):
+            ee = START.ee[0] + min(1.0, (k + 1) / 35) * (pos - START.ee[0]), rot
+            q = SOLVERS["placo"].step(path[-1], ee, START.soles, START.hull, ROBOT.default_q, POSTURE)
+            assert q is not None
+            path.append(q)
+        paths.append(np.array(path))
+    return paths
+
+
+def test_both_solvers_keep_arm_and_body_apart(hugging):
+    clearance = Clearance(ROBOT, MODEL.model, WEIGHTS.collision_trigger)
+    nearest = []
+    for path, place in zip(hugging, HUGGING, strict=True):
+        ee = np.array(place) + BESIDE, START.ee[1]
+        for q in path:
+            MODEL.update(q)
+            nearest.append(min(clearance.rows(MODEL.data)[1], default=np.inf))
+        for q in path[::6]:
+            program = ee, START.soles, START.hull, ROBOT.default_q, POSTURE
+            steps = [s.step(q, *program) for s in SOLVERS.values()]
+            np.testing.assert_allclose(steps[1], steps[0], atol=1e-5)
+    assert np.mean(np.array(nearest) < WEIGHTS.collision_trigger) > 0.5  # else this tests nothing
+    assert min(nearest) > 0.5 * WEIGHTS.collision_margin
+
+
+def test_closing_rows_are_derivatives_of_their_distances(hugging):
+    h = 1e-4  # distances come from iterations that stop at 1e-6 m
+    clearance = Clearance(ROBOT, MODEL.model, np.inf)  # every pair, near or not
+
+    def distances(q: np.ndarray) -> np.ndarray:
+        MODEL.update(q)
+        return clearance.rows(MODEL.data)[1]
+
+    for path in hugging:
+        MODEL.update(path[-1])
+        closing, _ = clearance.rows(MODEL.data)
+        slope = [
+            (
+                distances(pin.integrate(MODEL.model, path[-1], d))
+                - distances(pin.integrate(MODEL.model, path[-1], -d))
+            )
+            / (2 * h)
+            for d in h * np.eye(MODEL.model.nv)
+        ]
+        np.testing.assert_allclose(-closing.T, slope, atol=0.02)
 
 
 def test_half_planes_of_a_square():

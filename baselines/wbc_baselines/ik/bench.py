@@ -1,8 +1,9 @@
 """Solve time of one step of whole-body IK: PlaCo and OSQP beside Pink and mink, on one and the same problem.
 
 Pink and mink ship neither a support polygon nor a foot constraint without roll and yaw; both are added here
-through their public interfaces, as a limit and a task. What keeps arm and body apart is soft in `placo_ik` and
-hard in these two, whose limits have no slack; otherwise all solve the same program.
+through their public interfaces, as a limit and a task. What keeps arm and body apart is soft in `placo_ik`
+and hard in these two, whose limits have no slack; otherwise all solve the same program. It is the one of
+planning, whose posture hardly pulls at the hand.
 """
 
 import time
@@ -76,7 +77,7 @@ class Ours:
 
     def step(self, q: Array, ee: Pose) -> Array | None:
         scene = self._scene
-        default, weight = scene.robot.default_q, scene.weights.posture
+        default, weight = scene.robot.default_q, scene.weights.planning_posture
         return self._ik.step(q, ee, scene.soles, scene.hull, default, weight)
 
 
@@ -132,7 +133,7 @@ def make_pink(scene: Scene) -> Solver:
             upright = FrameTask("base_Link", 0.0, np.sqrt(weights.upright))
             upright.set_target(pin.SE3.Identity())
             com = ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
-            posture = PostureTask(float(np.sqrt(weights.posture)))
+            posture = PostureTask(float(np.sqrt(weights.planning_posture)))
             for task, (pos, rot) in zip((left, right, flat), [*scene.soles, scene.soles[1]], strict=True):
                 task.set_target(pin.SE3(rot, pos))
             com.set_target(np.array([*scene.hull.mean(axis=0), 0.0]))
@@ -207,7 +208,7 @@ def make_mink(scene: Scene) -> Solver:
             upright = mink.FrameTask("base_Link", "body", 0.0, np.sqrt(weights.upright))
             upright.set_target(mink.SE3.identity())
             com = mink.ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
-            posture = mink.PostureTask(model, float(np.sqrt(weights.posture)))
+            posture = mink.PostureTask(model, float(np.sqrt(weights.planning_posture)))
             for task, pose in zip((left, right, flat), [*scene.soles, scene.soles[1]], strict=True):
                 task.set_target(_se3(pose))
             com.set_target(np.array([*scene.hull.mean(axis=0), 0.0]))

@@ -19,7 +19,7 @@ from wbc_bench.robot import NUM_JOINTS, Robot
 Array = NDArray[np.float64]
 BASE = 6  # tangent coordinates of the free base, before those of the joints
 
-# Otherwise every solve looks for OSQP's builds on CUDA and MKL first, and would take them where there are any.
+# Otherwise every solve looks for OSQP's builds on CUDA and MKL first, and takes them where there are any.
 osqp.interface.OSQP_ALGEBRA_BACKEND = "builtin"
 # Close enough for the active set to be right; polishing then solves it to machine precision. rho adapts by
 # iterations, not by the clock, which would make the answer depend on the load of the machine.
@@ -237,11 +237,11 @@ def solve(program: Program) -> Array | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # qpsolvers warns of what `found` says already
         solution = qpsolvers.solve_problem(problem, solver="osqp", **OPTIONS)
-    return solution.x[:n] if solution.found else None
+    return solution.x[:n] if solution.found and solution.x is not None else None
 
 
 class Pattern(NamedTuple):
-    """The entries of a matrix that can differ from zero. SciPy's search for them takes as long as the solution."""
+    """The entries of a matrix that can differ from zero: SciPy's own search for them takes too long."""
 
     matrix: sparse.csc_matrix
     transposed: NDArray[np.bool_]
