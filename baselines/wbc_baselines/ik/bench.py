@@ -17,9 +17,9 @@ import pinocchio as pin
 import qpsolvers
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
+from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK, half_planes
-from wbc_baselines.ik.placo_ik import ARM_LINKS, BODY_LINKS, PlacoIK
+from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import TUNED, Weights
 from wbc_baselines.ik.stance import base_from_stance, measured_stance
 from wbc_bench.manifest import manifest_path, read_manifest

@@ -9,6 +9,9 @@ from wbc_bench.robot import JOINT_NAMES, Robot
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # position (3,) [m], rotation (3, 3)
 GRAVITY = 9.81  # [m/s^2]
+# parts that can meet: every one of the arm with every one of the body
+ARM_LINKS = ("arm_link3", "arm_link5", "arm_link6")
+BODY_LINKS = ("base_Link", "hip_L_Link", "knee_L_Link", "hip_R_Link", "knee_R_Link")
 
 
 class WholeBodyModel:

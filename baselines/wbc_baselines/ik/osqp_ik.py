@@ -11,8 +11,7 @@ import qpsolvers
 from numpy.typing import NDArray
 from scipy import sparse
 
-from wbc_baselines.ik.model import Pose, WholeBodyModel
-from wbc_baselines.ik.placo_ik import ARM_LINKS, BODY_LINKS
+from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel
 from wbc_baselines.ik.settings import Weights
 from wbc_bench.robot import NUM_JOINTS, Robot
 

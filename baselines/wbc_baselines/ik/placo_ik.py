@@ -11,13 +11,11 @@ import numpy as np
 import placo
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.model import Pose
+from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose
 from wbc_baselines.ik.settings import Weights
 from wbc_bench.robot import JOINT_NAMES, Robot
 
 Array = NDArray[np.float64]
-ARM_LINKS = ("arm_link3", "arm_link5", "arm_link6")
-BODY_LINKS = ("base_Link", "hip_L_Link", "knee_L_Link", "hip_R_Link", "knee_R_Link")
 
 
 class PlacoIK:
