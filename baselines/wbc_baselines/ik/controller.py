@@ -10,7 +10,8 @@ from wbc_baselines.ik.hand import solve_arm
 from wbc_baselines.ik.model import GRAVITY, Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.reference import Reference, plan
 from wbc_baselines.ik.settings import Settings
-from wbc_baselines.ik.stance import Stance, base_from_stance, measured_stance
+from wbc_baselines.ik.stance import Stance, base_from_sole, base_from_stance, measured_stance, yaw_matrix
+from wbc_baselines.ik.stepping import Swing, choose, landing, outside, pressure, solve_leg
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
@@ -24,6 +25,7 @@ class _Episode:
 
     def __init__(self, stance: Stance, q: Array, reference: Reference, com: ComFilter) -> None:
         self.step = 0
+        self.swing: Swing | None = None
         self.stance = stance
         self.hull = np.zeros((3, 2))  # (V, 2) [m] of the soles
         self.q = q  # (21,) reference configuration
@@ -91,6 +93,15 @@ class IKController:
         reference = Reference(s, PERIOD, model.ee_of(q), goal, self._robot.default_q)
         return _Episode(_stance_of(pos, rot, soles_b), q, reference, com)
 
+    def _land(self, e: _Episode, base: Pose, soles_b: list[Pose], joints: Array, target_b: Pose) -> None:
+        """Both feet stand again: start over from here, but for what is known of the centre of mass."""
+        pos, rot = base
+        e.swing, e.step = None, 0
+        e.stance = _stance_of(pos, rot, soles_b)
+        e.q = configuration(pos, rot, joints)
+        goal = (pos + rot @ target_b[0], rot @ target_b[1])
+        e.reference = Reference(self._s, PERIOD, self._model.ee_of(e.q), goal, e.reference.posture)
+
     def _step(
         self, e: _Episode, raw: Array, joints: Array, up_b: Array, ang_vel_b: Array, target_b: Pose
     ) -> bool:
@@ -99,6 +110,14 @@ class IKController:
         e.step += 1
         # raw joint angles: a filter before the one of the centre of mass would only delay it
         soles_b = model.soles_in_base(raw)
+        if e.swing is not None:
+            stand = 1 - e.swing.side
+            base = base_from_sole(soles_b[stand], up_b, e.stance.xy[stand], float(e.stance.yaw[stand]))
+            if e.swing.left > 0:
+                self._swing(e, e.swing, base, raw, joints, ang_vel_b)
+                return True
+            self._land(e, base, soles_b, joints, target_b)
+            e.step = 1
         pos, rot = base_from_stance(soles_b, up_b, e.stance)
         e.stance = e.stance.toward(_stance_of(pos, rot, soles_b), PERIOD / s.stance_filter)
         if e.step % 10 == 1:
@@ -135,10 +154,49 @@ class IKController:
         if s.feedback and near > 0:
             e.command[ARM] += near * (self._hold_hand(e, joints, target_b) - q[7:][ARM])
         if s.feedforward:
-            torques = self._balance(e, configuration(pos, rot, raw), rot, ang_vel_b)
+            torques = self._balance(e, configuration(pos, rot, raw), rot, ang_vel_b, (0, 1))
             e.command += np.clip(torques, -self._robot.effort, self._robot.effort) / self._robot.kp
             e.command[LEGS] += s.compliance * (joints - q[7:])[LEGS]
+        if s.stepping and e.step * PERIOD > s.step_wait:
+            capture, rate = e.com.capture_point()
+            if outside(capture, e.hull) > s.step_trigger:
+                side = choose(s, e.stance, capture, rate, model.corners)
+                e.swing = Swing(side, s.step_duration, joints[_leg(side)].copy())
         return True
+
+    def _swing(self, e: _Episode, swing: Swing, base: Pose, raw: Array, joints: Array, ang_vel_b: Array) -> None:
+        """One control step on one foot: it carries the robot, the other leg swings, the arm stays as it is."""
+        s, model, (pos, rot) = self._s, self._model, base
+        stand = 1 - swing.side
+        measured = configuration(pos, rot, raw)
+        torques = self._balance(e, measured, rot, ang_vel_b, (stand,))
+        swing.time += PERIOD
+        capture, rate = e.com.capture_point()
+        if swing.landing is None or swing.left > s.step_aim:
+            swing.landing = landing(s, e.stance, swing.side, capture, rate, swing.left, model.corners)
+        # where the base will be when the foot lands
+        p = pressure(capture, e.stance.xy[stand], float(e.stance.yaw[stand]), model.corners)
+        grow = rate * swing.left
+        com = e.com.pos[:2]
+        shift = (np.cosh(grow) - 1) * (com - p) + np.sinh(grow) / rate * e.com.vel[:2]
+        yaw = yaw_matrix(float(e.stance.yaw[stand]))
+        leg, standing = _leg(swing.side), _leg(stand)
+        goals = []
+        for part, height in ((1.0, -s.step_press), (0.5, s.step_height)):
+            start = e.stance.xy[swing.side]
+            xy = start + part * (swing.landing.xy - start)
+            base_pos = pos + part * np.array([*shift, 0.0])
+            where = np.array([*xy, height]) - base_pos
+            goals.append(solve_leg(model, raw, swing.side, (rot.T @ where, rot.T @ yaw)))
+        q, qd, qdd = swing.follow(*goals)
+        swing.dbg = (q, goals)
+        kp, kd = self._robot.kp, self._robot.kd
+        accelerations = np.zeros(14)
+        accelerations[leg] = qdd
+        torques[leg] = model.torques(measured, e.acceleration, accelerations)[leg]
+        torques = np.clip(torques, -self._robot.effort, self._robot.effort)
+        e.command[leg] = q + (torques[leg] + kd[leg] * qd) / kp[leg]
+        e.command[standing] = joints[standing] + torques[standing] / kp[standing]
 
     def _hold_hand(self, e: _Episode, joints: Array, target_b: Pose) -> Array:
         """Arm joints (6,) [rad] that keep the hand where the slewed target is, seen from the swaying base."""
@@ -155,13 +213,15 @@ class IKController:
         arm = solve_arm(self._model, e.q[7:], (pos, rot), s.hand_damping, s.hand_limit)
         return np.clip(arm, self._robot.lower[ARM], self._robot.upper[ARM])
 
-    def _balance(self, e: _Episode, measured: Array, rot: Array, ang_vel_b: Array) -> Array:
+    def _balance(
+        self, e: _Episode, measured: Array, rot: Array, ang_vel_b: Array, standing: tuple[int, ...]
+    ) -> Array:
         """Torques (14,) [N m] that carry the weight and bring centre of mass and base to the reference."""
         s, model = self._s, self._model
         model.update(measured)
         e.com.update(model.data.com[0], e.acceleration, self._gravity.deviation)
-        soles = [model.pose(sole) for sole in model.soles]
-        jacobians = [model.jacobian(sole) for sole in model.soles]
+        soles = [model.pose(model.soles[side]) for side in standing]
+        jacobians = [model.jacobian(model.soles[side]) for side in standing]
         torques = model.gravity_torques(measured)
         wrench = np.zeros(6)
         wrench[2] = model.mass * GRAVITY
@@ -178,9 +238,13 @@ class IKController:
         forces = distribute(points, self._rays, wrench, self._weight, s.damping)
         e.acceleration = forces.sum(axis=0) / model.mass
         e.acceleration[2] -= GRAVITY
-        for jacobian, arm, force in zip(jacobians, arms, (forces[:4], forces[4:]), strict=True):
+        for jacobian, arm, force in zip(jacobians, arms, np.split(forces, len(arms)), strict=True):
             torques -= jacobian.T @ np.concatenate([force.sum(axis=0), moment_of(arm, force)])
         return torques[6:]
+
+
+def _leg(side: int) -> slice:
+    return slice(4 * side, 4 * side + 4)
 
 
 def moment_of(arms: Array, forces: Array) -> Array:

@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
+from wbc_baselines.ik.model import GRAVITY
+
 Array = NDArray[np.float64]
 
 
@@ -101,3 +103,11 @@ class ComFilter:
         gain = cov[:, 0] / (cov[0, 0] + noise)
         self.pos, self.vel = pred + gain[0] * innovation, vel + gain[1] * innovation
         self._cov = cov - gain[:, None] * cov[0]
+
+    def capture_point(self) -> tuple[Array, float]:
+        """Where (2,) [m] a foot would bring the mass to rest, and the rate [1/s] at which that runs away.
+
+        Source: Pratt et al. 2006.
+        """
+        rate = float(np.sqrt(GRAVITY / max(self.pos[2], 0.2)))  # [1/s] of the linear inverted pendulum
+        return self.pos[:2] + self.vel[:2] / rate, rate

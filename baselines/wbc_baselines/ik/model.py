@@ -45,6 +45,19 @@ class WholeBodyModel:
         pin.updateFramePlacement(self.model, self.data, self.tcp)
         return self.pose(self.tcp), self.jacobian(self.tcp)[:, 14:]
 
+    def leg_in_base(self, joints: Array, side: int) -> tuple[Pose, Array]:
+        """Pose of a sole in the base frame, and its Jacobian (6, 4) by the leg's joints, base-aligned."""
+        self._q[7:] = joints
+        pin.computeJointJacobians(self.model, self.data, self._q)
+        pin.updateFramePlacement(self.model, self.data, self.soles[side])
+        return self.pose(self.soles[side]), self.jacobian(self.soles[side])[:, 6 + 4 * side : 10 + 4 * side]
+
+    def torques(self, q: Array, base_acceleration: Array, joint_acceleration: Array) -> Array:
+        """Joint torques (14,) [N m] of an acceleration (3,) [m/s^2] of the base and of the joints (14,), from rest."""
+        rot = pin.Quaternion(q[3:7]).toRotationMatrix()
+        acceleration = np.concatenate([rot.T @ base_acceleration, np.zeros(3), joint_acceleration])
+        return pin.rnea(self.model, self.data, q, np.zeros(20), acceleration)[6:]
+
     def update(self, q: Array) -> None:
         """Kinematics, Jacobians and centre of mass at q."""
         pin.computeJointJacobians(self.model, self.data, q)

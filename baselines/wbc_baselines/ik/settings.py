@@ -65,6 +65,17 @@ class Settings:
     compliance: float = 0.5  # part of the legs' posture stiffness that is taken away
     friction: float = 0.4  # the lowest of the protocol's range
     sole_width: float = 0.7  # part of the sole's width that carries contact forces
+    # stepping
+    stepping: bool = True
+    step_trigger: float = 0.0  # [m] of the capture point outside the soles' hull
+    step_wait: float = 0.1  # [s] of standing before a step
+    step_duration: float = 0.25  # [s]
+    step_height: float = 0.06  # [m]
+    step_press: float = 0.01  # [m] below the ground that the landing foot is sent to
+    step_length: float = 0.35  # [m] from the standing foot, either way
+    step_width: tuple[float, float] = (0.17, 0.40)  # [m] between the soles
+    step_beside: float = 0.04  # [m] of the landing sole outside the capture point
+    step_aim: float = 0.1  # [s] before landing the place is fixed
     # estimation; noise half-widths are those of the paper's lineage, see the protocols
     gyro_noise: float = 0.2  # [rad/s]
     gravity_noise: float = 0.05

@@ -73,3 +73,14 @@ def base_from_stance(
     pos = -rot @ (0.5 * (soles_b[0][0] + soles_b[1][0]))
     pos[:2] += centre
     return pos, rot
+
+
+def base_from_sole(sole_b: tuple[Array, Array], up_b: Array, xy: Array, yaw: float) -> tuple[Array, Array]:
+    """Base pose in the anchor frame from the vertical and the only sole that stands, at `xy` (2,) [m], `yaw`."""
+    heading = sole_b[1][:, 0]
+    x = heading - up_b * (up_b @ heading)
+    x /= np.sqrt(x @ x)
+    rot = yaw_matrix(yaw) @ np.stack([x, np.cross(up_b, x), up_b])
+    pos = -rot @ sole_b[0]
+    pos[:2] += xy
+    return pos, rot
