@@ -18,7 +18,9 @@ def make(robot: Robot, variant: str = "") -> IKController:
     """The controller of a variant. Raises: UnknownNameError."""
     if variant not in VARIANTS:
         raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
-    settings = replace(TUNED, feedforward=False, feedback=False, stepping=False) if variant == "kinematic" else TUNED
+    settings = (
+        replace(TUNED, feedforward=False, feedback=False, stepping=False) if variant == "kinematic" else TUNED
+    )
     # imported here: each solver is needed only by its own variant
     if variant == "osqp":
         from wbc_baselines.ik.osqp_ik import OsqpIK as Solver

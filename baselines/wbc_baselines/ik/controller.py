@@ -26,6 +26,7 @@ class _Episode:
     def __init__(self, stance: Stance, q: Array, reference: Reference, com: ComFilter) -> None:
         self.step = 0
         self.swing: Swing | None = None
+        self.prepared = False
         self.stance = stance
         self.hull = np.zeros((3, 2))  # (V, 2) [m] of the soles
         self.q = q  # (21,) reference configuration
@@ -96,7 +97,7 @@ class IKController:
     def _land(self, e: _Episode, base: Pose, soles_b: list[Pose], joints: Array, target_b: Pose) -> None:
         """Both feet stand again: start over from here, but for what is known of the centre of mass."""
         pos, rot = base
-        e.swing, e.step = None, 0
+        e.swing, e.step = None, 1
         e.stance = _stance_of(pos, rot, soles_b)
         e.q = configuration(pos, rot, joints)
         goal = (pos + rot @ target_b[0], rot @ target_b[1])
@@ -117,7 +118,6 @@ class IKController:
                 self._swing(e, e.swing, base, raw, joints, ang_vel_b)
                 return True
             self._land(e, base, soles_b, joints, target_b)
-            e.step = 1
         pos, rot = base_from_stance(soles_b, up_b, e.stance)
         e.stance = e.stance.toward(_stance_of(pos, rot, soles_b), PERIOD / s.stance_filter)
         if e.step % 10 == 1:
@@ -128,17 +128,7 @@ class IKController:
         reference.track((pos + rot @ target_b[0], rot @ target_b[1]))
         if e.step * PERIOD > s.settle:
             if reference.goal is None:
-                goal, _ = plan(
-                    self._solver,
-                    model,
-                    e.q,
-                    reference.ee,
-                    reference.target,
-                    soles,
-                    e.hull,
-                    self._robot.default_q,
-                    s.weights.planning_posture,
-                )
+                goal, _ = self._plan(e, e.stance, e.hull)
                 reference.set_goal(e.q[7:].copy(), goal)
             reference.advance()
         weight = s.weights.standing_posture if reference.goal is None else s.weights.posture
@@ -159,13 +149,35 @@ class IKController:
             e.command[LEGS] += s.compliance * (joints - q[7:])[LEGS]
         if s.stepping and e.step * PERIOD > s.step_wait:
             capture, rate = e.com.capture_point()
-            if outside(capture, e.hull) > s.step_trigger:
+            if outside(capture, e.hull) > s.step_trigger or self._may_widen(e, capture, rate):
                 side = choose(s, e.stance, capture, rate, model.corners)
                 e.swing = Swing(side, s.step_duration, joints[_leg(side)].copy())
         return True
 
-    def _swing(self, e: _Episode, swing: Swing, base: Pose, raw: Array, joints: Array, ang_vel_b: Array) -> None:
-        """One control step on one foot: it carries the robot, the other leg swings, the arm stays as it is."""
+    def _may_widen(self, e: _Episode, capture: Array, rate: float) -> bool:
+        """Once, standing calmly on a narrow stance: whether the target stays in reach from a wider one."""
+        s, model = self._s, self._model
+        if e.prepared or e.step * PERIOD < s.step_prepare_time:
+            return False
+        e.prepared = True
+        if e.stance.width() > s.step_prepare:
+            return False
+        side = choose(s, e.stance, capture, rate, model.corners)
+        wider = e.stance.moved(
+            side, landing(s, e.stance, side, capture, rate, s.step_duration, model.corners).xy
+        )
+        _, error = self._plan(e, wider, wider.hull(model.corners))
+        return error < s.step_prepare_error
+
+    def _plan(self, e: _Episode, stance: Stance, hull: Array) -> tuple[Array, float]:
+        """Joint positions (14,) at the target on a stance, and the error [m + 0.3 m/rad] left there."""
+        way, default, weight = e.reference, self._robot.default_q, self._s.weights.planning_posture
+        return plan(self._solver, self._model, e.q, way.ee, way.target, stance.poses(), hull, default, weight)
+
+    def _swing(
+        self, e: _Episode, swing: Swing, base: Pose, raw: Array, joints: Array, ang_vel_b: Array
+    ) -> None:
+        """One control step on one foot: it carries the robot, the other leg swings, the arm is held."""
         s, model, (pos, rot) = self._s, self._model, base
         stand = 1 - swing.side
         measured = configuration(pos, rot, raw)
@@ -189,7 +201,6 @@ class IKController:
             where = np.array([*xy, height]) - base_pos
             goals.append(solve_leg(model, raw, swing.side, (rot.T @ where, rot.T @ yaw)))
         q, qd, qdd = swing.follow(*goals)
-        swing.dbg = (q, goals)
         kp, kd = self._robot.kp, self._robot.kd
         accelerations = np.zeros(14)
         accelerations[leg] = qdd

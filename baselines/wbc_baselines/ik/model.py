@@ -53,7 +53,7 @@ class WholeBodyModel:
         return self.pose(self.soles[side]), self.jacobian(self.soles[side])[:, 6 + 4 * side : 10 + 4 * side]
 
     def torques(self, q: Array, base_acceleration: Array, joint_acceleration: Array) -> Array:
-        """Joint torques (14,) [N m] of an acceleration (3,) [m/s^2] of the base and of the joints (14,), from rest."""
+        """Joint torques (14,) [N m] that accelerate base (3,) [m/s^2] and joints (14,) from rest at q."""
         rot = pin.Quaternion(q[3:7]).toRotationMatrix()
         acceleration = np.concatenate([rot.T @ base_acceleration, np.zeros(3), joint_acceleration])
         return pin.rnea(self.model, self.data, q, np.zeros(20), acceleration)[6:]

@@ -114,25 +114,21 @@ class OsqpIK:
         model.update(q)
         com_jacobian = pin.jacobianCenterOfMass(model.model, model.data)[:2]
         com_pos = model.data.com[0][:2]
-        left, right = model.soles
+        feet = list(zip(model.soles, soles, strict=True))
+        flat = [self.orientation(sole, rot) for sole, (_, rot) in feet]
         soft = [
             (weights.ee_position, self.position(model.tcp, ee[0])),
             (weights.ee_orientation, self.orientation(model.tcp, ee[1])),
-            (weights.foot_flat, self.orientation(right, soles[1][1])),
+            *((weights.foot_flat, turning) for turning in flat),
             (weights.com, Row(com_jacobian, hull.mean(axis=0) - com_pos)),
             (weights.upright, self.orientation(self._base, np.eye(3))),
             (posture_weight, Row(self._select, posture - q[7:])),
             (weights.regularization, Row(self._select, np.zeros(len(posture)))),
         ]
-        # Two hard 6-D feet have rank 10 of 12 on these 4-DoF legs: the right one gives up roll and yaw.
-        turning = self.orientation(right, soles[1][1])
-        axis = soles[1][1][:, 1]  # of the ankle
-        hard = [
-            self.position(left, soles[0][0]),
-            self.orientation(left, soles[0][1]),
-            self.position(right, soles[1][0]),
-            Row(axis[None] @ turning.jacobian, axis[None] @ turning.error),
-        ]
+        hard = []  # position and pitch of both feet: see `placo_ik`
+        for (sole, (pos, rot)), turning in zip(feet, flat, strict=True):
+            axis = rot[:, 1]  # of the ankle
+            hard += [self.position(sole, pos), Row(axis[None] @ turning.jacobian, axis[None] @ turning.error)]
         normal, offset = half_planes(hull)
         closing, room = self._clearance.rows(model.data)
         lower, upper = self._lower - q[7:], self._upper - q[7:]

@@ -38,17 +38,18 @@ class PlacoIK:
         ee = solver.add_frame_task("tcp", np.eye(4))
         ee.configure("ee", "soft", weights.ee_position, weights.ee_orientation)
         self._ee = ee.position(), ee.orientation()
-        # Two 6-D foot constraints have rank 10 of 12 on 4-DoF legs: the right foot gives up roll and yaw.
-        left = solver.add_frame_task("sole_L", np.eye(4))
-        left.configure("left", "hard", 1.0, 1.0)
-        self._left = left.position(), left.orientation()
-        self._right = solver.add_position_task("sole_R", np.zeros(3))
-        self._right.configure("right", "hard", 1.0)
-        self._pitch = solver.add_orientation_task("sole_R", np.eye(3))
-        self._pitch.configure("right_pitch", "hard", 1.0)
-        self._pitch.mask.set_axises("y", "local")
-        self._flat = solver.add_orientation_task("sole_R", np.eye(3))
-        self._flat.configure("right_flat", "soft", weights.foot_flat)
+        # Legs of 4 joints without an ankle roll: two 6-D feet have rank 10 of 12, and in a stance that is
+        # wider or narrower than the hips no sole can be flat. Position and pitch are hard, the rest is soft.
+        self._feet = []
+        for side in "LR":
+            position = solver.add_position_task(f"sole_{side}", np.zeros(3))
+            position.configure(f"{side}_position", "hard", 1.0)
+            pitch = solver.add_orientation_task(f"sole_{side}", np.eye(3))
+            pitch.configure(f"{side}_pitch", "hard", 1.0)
+            pitch.mask.set_axises("y", "local")
+            flat = solver.add_orientation_task(f"sole_{side}", np.eye(3))
+            flat.configure(f"{side}_flat", "soft", weights.foot_flat)
+            self._feet.append((position, pitch, flat))
         self._centre = np.zeros(3)
         self._com = solver.add_com_task(self._centre)
         self._com.mask.set_axises("xy")  # pyright: ignore[reportCallIssue]  (the stub lacks the default)
@@ -82,11 +83,10 @@ class PlacoIK:
         robot, solver = self._robot, self._solver
         robot.state.q = q
         robot.update_kinematics()
-        for (position, orientation), (pos, rot) in ((self._ee, ee), (self._left, soles[0])):
-            position.target_world, orientation.R_world_frame = pos, rot
-        self._right.target_world = soles[1][0]
-        self._pitch.R_world_frame = soles[1][1]
-        self._flat.R_world_frame = soles[1][1]
+        self._ee[0].target_world, self._ee[1].R_world_frame = ee
+        for (position, pitch, flat), (pos, rot) in zip(self._feet, soles, strict=True):
+            position.target_world = pos
+            pitch.R_world_frame = flat.R_world_frame = rot
         self._centre[:2] = np.add.reduce(hull) / len(hull)  # np.mean takes four times as long
         self._com.target_world = self._centre
         self._polygon.polygon = list(hull[::-1])  # PlaCo wants it clockwise

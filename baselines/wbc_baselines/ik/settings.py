@@ -35,9 +35,9 @@ class Settings:
 
     weights: Weights = field(default_factory=Weights)
     # the way of the target
-    slew_linear: float = 0.2  # [m/s]
-    slew_angular: float = 0.6  # [rad/s]
-    slew_ramp: float = 1.0  # [s] from rest to full speed
+    slew_linear: float = 0.25  # [m/s]
+    slew_angular: float = 0.75  # [rad/s]
+    slew_ramp: float = 0.8  # [s] from rest to full speed
     slew_gain: float = 2.0  # [1/s] slowing down near the end
     settle: float = 0.3  # [s] of standing still before the target moves
     target_filter: float = 0.3  # [s]
@@ -71,10 +71,13 @@ class Settings:
     step_wait: float = 0.1  # [s] of standing before a step
     step_duration: float = 0.25  # [s]
     step_height: float = 0.06  # [m]
+    step_prepare: float = 0.28  # [m] between the soles, below which a foot is set further out to begin with
+    step_prepare_time: float = 0.6  # [s] of standing before that
+    step_prepare_error: float = 0.01  # [m + 0.3 m/rad] of the plan from there
     step_press: float = 0.01  # [m] below the ground that the landing foot is sent to
     step_length: float = 0.35  # [m] from the standing foot, either way
     step_width: tuple[float, float] = (0.17, 0.40)  # [m] between the soles
-    step_beside: float = 0.04  # [m] of the landing sole outside the capture point
+    step_beside: float = 0.11  # [m] of the landing sole outside the capture point
     step_aim: float = 0.1  # [s] before landing the place is fixed
     # estimation; noise half-widths are those of the paper's lineage, see the protocols
     gyro_noise: float = 0.2  # [rad/s]

@@ -26,6 +26,17 @@ class Stance(NamedTuple):
         """A step from this stance to another."""
         return Stance(self.xy + fraction * (other.xy - self.xy), self.yaw + fraction * (other.yaw - self.yaw))
 
+    def moved(self, side: int, xy: Array) -> "Stance":
+        """With one sole at another place (2,) [m], turned like the other."""
+        places, yaw = self.xy.copy(), self.yaw.copy()
+        places[side], yaw[side] = xy, yaw[1 - side]
+        return Stance(places, yaw)
+
+    def width(self) -> float:
+        """Distance [m] between the soles across their mean heading."""
+        yaw = self.yaw.mean()
+        return float((self.xy[0] - self.xy[1]) @ [-np.sin(yaw), np.cos(yaw)])
+
     def hull(self, corners: Array) -> Array:
         """Convex hull (V, 2) [m], counter-clockwise, of sole corners (C, 3) given in the sole frame."""
         points = np.concatenate([pos + corners @ rot.T for pos, rot in self.poses()])[:, :2]
@@ -76,7 +87,7 @@ def base_from_stance(
 
 
 def base_from_sole(sole_b: tuple[Array, Array], up_b: Array, xy: Array, yaw: float) -> tuple[Array, Array]:
-    """Base pose in the anchor frame from the vertical and the only sole that stands, at `xy` (2,) [m], `yaw`."""
+    """Base pose in the anchor frame from the vertical and the one sole that stands, at `xy` (2,) [m]."""
     heading = sole_b[1][:, 0]
     x = heading - up_b * (up_b @ heading)
     x /= np.sqrt(x @ x)

@@ -1,8 +1,8 @@
 """A step of one foot to where the falling centre of mass can be caught.
 
-While both feet stand, contact forces alone keep the capture point over the soles. Once it has left their hull no
-force can bring it back, and one foot is put where it will be. Source: Pratt et al. 2006 (capture point); the
-swing follows Koolen et al. 2012, eq. 10, with the centre of pressure at the near end of the standing sole.
+While both feet stand, contact forces alone keep the capture point over the soles. Once it has left their hull
+no force can bring it back, and one foot is put where it will be. Source: Pratt et al. 2006 (capture point);
+Koolen et al. 2012, eq. 10 (its motion about a centre of pressure, here the near end of the standing sole).
 """
 
 from typing import NamedTuple
@@ -46,10 +46,10 @@ class Swing:
         Source: minimum jerk, Flash & Hogan 1985; the foot rises and sinks as 16 s^2 (1 - s)^2.
         """
         s = min(1.0, self.time / self.duration)
-        way = np.array([10 * s**3 - 15 * s**4 + 6 * s**5, 30 * (s - s**2) ** 2, 60 * s * (1 - s) * (1 - 2 * s)])
-        rise = 16 * np.array(
-            [s**2 * (1 - s) ** 2, 2 * s * (1 - s) * (1 - 2 * s), 2 * (1 - 6 * s + 6 * s**2)]
+        way = np.array(
+            [10 * s**3 - 15 * s**4 + 6 * s**5, 30 * (s - s**2) ** 2, 60 * s * (1 - s) * (1 - 2 * s)]
         )
+        rise = 16 * np.array([s**2 * (1 - s) ** 2, 2 * s * (1 - s) * (1 - 2 * s), 2 * (1 - 6 * s + 6 * s**2)])
         rate = self.duration ** -np.arange(3.0)
         across, up = goal - self._start, raised - 0.5 * (self._start + goal)
         pos, vel, acc = rate[:, None] * (way[:, None] * across + rise[:, None] * up)
@@ -57,7 +57,7 @@ class Swing:
 
 
 def outside(point: Array, hull: Array) -> float:
-    """How far [m] a point (2,) is outside a convex hull (V, 2) in counter-clockwise order; negative inside."""
+    """How far [m] a point (2,) is outside a counter-clockwise convex hull (V, 2); negative inside."""
     edge = np.roll(hull, -1, axis=0) - hull
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1)[:, None]
     return float(((point - hull) * normal).sum(axis=1).max())
@@ -70,7 +70,9 @@ def pressure(point: Array, xy: Array, yaw: float, corners: Array) -> Array:
     return xy + rot @ inside
 
 
-def landing(s: Settings, stance: Stance, side: int, capture: Array, rate: float, left: float, corners: Array) -> Landing:
+def landing(
+    s: Settings, stance: Stance, side: int, capture: Array, rate: float, left: float, corners: Array
+) -> Landing:
     """Where foot `side` is to land in `left` [s], from the capture point (2,) now.
 
     The capture point runs away from the other sole's pressure p as xi = p + (xi_0 - p) exp(omega t).
