@@ -1,4 +1,4 @@
-"""A shard of episodes under one controller, a control step at a time; where the targets come from is the caller's."""
+"""A shard of episodes under one controller, a control step at a time; the targets are the caller's."""
 
 from typing import NamedTuple
 
