@@ -12,6 +12,7 @@ import pandas as pd
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 
@@ -33,6 +34,7 @@ from wbc_bench.analysis import (
 )
 from wbc_bench.episodes import Outcome
 from wbc_bench.tables import CM, DEG, Study, methods_of
+from wbc_bench.tracking import STOOD, Track
 
 STYLE = Path(__file__).with_name("wbc.mplstyle")
 
@@ -363,3 +365,53 @@ def write_targets(frame: pd.DataFrame, name: str, out_dir: Path | str) -> list[P
         axes[1, 0].set_ylabel("Left y (m)")
         figure.suptitle(f"{name}: targets (+ start of the base)", x=0.01, ha="left", weight="bold")
         return save(figure, f"{name}_targets", out_dir)
+
+
+# --- moving targets -------------------------------------------------------------------------------------
+
+
+def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: dict[str, str]) -> Axes:
+    """Error over time of every run of one source; a cross where one fell. `name` as in `Tracked`."""
+    scale = CM if name == "position_error" else DEG
+    for track in tracks:
+        record, tracked = track
+        error = getattr(tracked, name) * scale
+        style = "-" if record.condition == "nominal" else DASHES[2]
+        colour = colours[record.controller]
+        ax.plot(tracked.time, error, ls=style, color=colour, lw=1.2)
+        if tracked.outcome != STOOD and len(error):
+            ax.plot(tracked.time[-1], min(error[-1], ERROR_CEILING[name]), "x", color=colour, ms=7, mew=1.6)
+    top = max((np.max(getattr(t.tracked, name), initial=0.0) * scale for t in tracks), default=0.0)
+    ax.set_ylim(0, min(1.08 * max(top, 1.0), 1.04 * ERROR_CEILING[name]))
+    return ax
+
+
+ERROR_CEILING = {"position_error": 30.0, "orientation_error": 40.0}  # [cm], [deg] beyond it a hand is lost
+
+
+def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
+    """Error over time as `tracking`: a row a source, position left, orientation right."""
+    sources = list(dict.fromkeys(track.record.source for track in tracks))
+    controllers = sorted({track.record.controller for track in tracks})
+    colours = dict(zip(controllers, METHOD_COLOURS * len(controllers), strict=False))
+    conditions = sorted({track.record.condition for track in tracks})
+    with _styled():
+        figure = Figure(figsize=(8.0, 0.9 + 1.45 * len(sources)))
+        axes = figure.subplots(len(sources), 2, squeeze=False)
+        for row, source in zip(axes, sources, strict=True):
+            own = [track for track in tracks if track.record.source == source]
+            tracking_error(row[0], own, "position_error", colours).set(title=source, ylabel="Position (cm)")
+            tracking_error(row[1], own, "orientation_error", colours).set(ylabel="Orientation (deg)")
+            for ax in row:
+                ax.set_xlim(0, max(track.record.requested_s for track in own))
+        for ax in axes[-1]:
+            ax.set_xlabel("Time (s)")
+        handles = [Line2D([], [], color=colours[name], label=name) for name in controllers]
+        if len(conditions) > 1:
+            styles = {"nominal": "-", "randomised": DASHES[2]}
+            handles += [Line2D([], [], color=GREY, ls=styles[name], label=name) for name in conditions]
+        if any(track.record.outcome != STOOD for track in tracks):
+            handles.append(Line2D([], [], color=GREY, ls="none", marker="x", ms=7, mew=1.6, label="fell"))
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        figure.suptitle("Error of the hand while its target moves", x=0.01, ha="left", weight="bold")
+        return save(figure, "tracking", out_dir)

@@ -1,7 +1,7 @@
 """Controller poses of four public stacks as targets: pure functions, one a message layout.
 
 Each takes the message as the builtins its own decoder gives (JSON, rosbridge) and returns what the sender
-held; `message.encode(..., relative=True)` then sends it as the motion of a device. Two axes conventions occur:
+held; `message.encode(..., relative=True)` then sends it as the motion of a device. Two conventions occur:
 
 - ROS, and ours: x forward, y left, z up. Source: REP 103.
 - OpenXR and WebXR: x right, y up, z backward. Source: WebXR Device API, section "Spaces".
@@ -38,7 +38,7 @@ class Reading(NamedTuple):
     engaged: bool  # the grip is held: the clutch is in
 
 
-# ---- vuer ------------------------------------------------------------------------------------------------------
+# ---- vuer --------------------------------------------------------------------------------------------------
 
 
 class _VuerState(msgspec.Struct):
@@ -74,7 +74,7 @@ def vuer(value: Any, time: float, side: Side = "right") -> Reading:
     return _from_xr(transform[:3, 3], rot, time, state.squeezeValue)
 
 
-# ---- XRoboToolkit ----------------------------------------------------------------------------------------------
+# ---- XRoboToolkit ------------------------------------------------------------------------------------------
 
 
 class _XRoboHand(msgspec.Struct):
@@ -95,9 +95,9 @@ class _XRobo(msgspec.Struct):
 def xrobotoolkit(value: Any, side: Side = "right") -> Reading:
     """XRoboToolkit's tracking JSON: pose "x,y,z,qx,qy,qz,qw" a hand, OpenXR axes, time stamp in ns.
 
-    Engaged while the grip is squeezed. Source: XR-Robotics/XRoboToolkit-Unity-Client
-    Assets/Scripts/TrackingData.cs (layout; "X right, Y up, Z in", right-handed); the axes as its own teleoperation
-    uses them are XRoboToolkit-Teleop-Sample-Python's R_HEADSET_TO_WORLD, which is `ROS_FROM_XR`.
+    Engaged while the grip is squeezed. Source: XR-Robotics/XRoboToolkit-Unity-Client TrackingData.cs (layout;
+    "right-handed, X right, Y up, Z in"). Which way "in" is, its own teleoperation says:
+    XRoboToolkit-Teleop-Sample-Python's R_HEADSET_TO_WORLD is `ROS_FROM_XR`.
 
     Raises: SourceError naming the field.
     """
@@ -113,7 +113,7 @@ def xrobotoolkit(value: Any, side: Side = "right") -> Reading:
     return _from_xr(pos, rot, tracking.timeStampNs * 1e-9, hand.grip)
 
 
-# ---- Quest2ROS -------------------------------------------------------------------------------------------------
+# ---- Quest2ROS ---------------------------------------------------------------------------------------------
 
 
 class _Xyz(msgspec.Struct):
@@ -150,11 +150,11 @@ class _Inputs(msgspec.Struct):
 
 
 def quest2ros(pose: Any, inputs: Any) -> Reading:
-    """geometry_msgs/PoseStamped of /q2r_*_hand_pose and OVR2ROSInputs of /q2r_*_hand_inputs, as rosbridge gives.
+    """PoseStamped of /q2r_*_hand_pose and OVR2ROSInputs of /q2r_*_hand_inputs, as rosbridge gives them.
 
-    The operator lines the controller up with the robot's base and presses both buttons (A+B or X+Y), which makes
-    that the frame of what follows: ROS axes, the base frame. Engaged while the middle finger presses. Source:
-    Quest2ROS/quest2ros@10c81e7 README.md, "Cordinate frame allignment", msg/OVR2ROSInputs.msg@891b264.
+    The operator lines the controller up with the robot's base and presses both buttons (A+B or X+Y), which
+    makes that the frame of what follows: the base frame, ROS axes. Engaged while the middle finger presses.
+    Source: Quest2ROS/quest2ros@10c81e7 README.md "Cordinate frame allignment", msg/OVR2ROSInputs.msg@891b264.
 
     Raises: SourceError naming the field.
     """
@@ -173,7 +173,7 @@ def quest2ros(pose: Any, inputs: Any) -> Reading:
     return Reading(target, buttons.press_middle > ENGAGED)
 
 
-# ---- UMI-on-Legs -----------------------------------------------------------------------------------------------
+# ---- UMI-on-Legs -------------------------------------------------------------------------------------------
 
 
 class _EefState(msgspec.Struct):
@@ -202,7 +202,7 @@ def umi_on_legs(value: Any) -> Sequence[StampedTarget]:
     return frames
 
 
-# ---- shared ----------------------------------------------------------------------------------------------------
+# ---- shared ------------------------------------------------------------------------------------------------
 
 
 def _convert(value: Any, kind: Any, stack: str) -> Any:

@@ -5,7 +5,7 @@ from pathlib import Path
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.protocol import PROTOCOL_DIR
 from wbc_bench.sources.interface import Source
-from wbc_bench.sources.live import LiveSource
+from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
 
@@ -19,7 +19,7 @@ def script_names() -> list[str]:
 
 def source_names() -> list[str]:
     """Everything that `load_source` knows by name."""
-    return [*script_names(), "live", "stream"]
+    return [*script_names(), "stream"]
 
 
 def find_script(name: str) -> Script:
@@ -35,12 +35,13 @@ def find_script(name: str) -> Script:
 
 
 def load_source(name: str, address: str = ADDRESS, allow_remote: bool = False) -> Source:
-    """The source of a name: `live`, `stream`, a script of the library, or a .toml file.
+    """The source of a name: `stream`, a script of the library or of a .toml file, or `stream:SCRIPT`.
 
     Raises: UnknownNameError (with the nearest names), SourceError.
     """
-    if name == "live":
-        return LiveSource()
     if name == "stream":
         return StreamSource(address, allow_remote=allow_remote)
+    if name.startswith("stream:"):
+        script = ScriptedSource(find_script(name.removeprefix("stream:")))
+        return PlayedStream(script, StreamSource(address, allow_remote=allow_remote))
     return ScriptedSource(find_script(name))
