@@ -371,22 +371,21 @@ def write_targets(frame: pd.DataFrame, name: str, out_dir: Path | str) -> list[P
 
 
 def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: dict[str, str]) -> Axes:
-    """Error over time of every run of one source; a cross where one fell. `name` as in `Tracked`."""
+    """Error over time of every run of one source, `name` as in `Tracked`; a cross at the top where one fell.
+
+    The axis is that of the runs that stood: the error of a robot on its way to the ground says nothing.
+    """
     scale = CM if name == "position_error" else DEG
-    for track in tracks:
-        record, tracked = track
-        error = getattr(tracked, name) * scale
-        style = "-" if record.condition == "nominal" else DASHES[2]
+    stood = [track for track in tracks if track.tracked.outcome == STOOD]
+    top = max(np.max(getattr(track.tracked, name), initial=0.0) * scale for track in stood or tracks)
+    for record, tracked in tracks:
+        line = "-" if record.condition == "nominal" else DASHES[2]
         colour = colours[record.controller]
-        ax.plot(tracked.time, error, ls=style, color=colour, lw=1.2)
-        if tracked.outcome != STOOD and len(error):
-            ax.plot(tracked.time[-1], min(error[-1], ERROR_CEILING[name]), "x", color=colour, ms=7, mew=1.6)
-    top = max((np.max(getattr(t.tracked, name), initial=0.0) * scale for t in tracks), default=0.0)
-    ax.set_ylim(0, min(1.08 * max(top, 1.0), 1.04 * ERROR_CEILING[name]))
+        ax.plot(tracked.time, getattr(tracked, name) * scale, ls=line, color=colour, lw=1.2)
+        if tracked.outcome != STOOD and len(tracked.time):
+            ax.plot(tracked.time[-1], top, "x", color=colour, ms=7, mew=1.6, clip_on=False)
+    ax.set_ylim(0, max(1.08 * top, 0.1))
     return ax
-
-
-ERROR_CEILING = {"position_error": 30.0, "orientation_error": 40.0}  # [cm], [deg] beyond it a hand is lost
 
 
 def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
@@ -406,6 +405,7 @@ def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
                 ax.set_xlim(0, max(track.record.requested_s for track in own))
         for ax in axes[-1]:
             ax.set_xlabel("Time (s)")
+        figure.align_ylabels()
         handles = [Line2D([], [], color=colours[name], label=name) for name in controllers]
         if len(conditions) > 1:
             styles = {"nominal": "-", "randomised": DASHES[2]}

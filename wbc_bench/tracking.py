@@ -41,7 +41,7 @@ class Tracked:
     @property
     def time(self) -> Array:
         """(T,) [s]"""
-        return np.arange(len(self.position_error)) * self.control_period
+        return self.control_period * np.arange(len(self.position_error), dtype=np.float64)
 
 
 class Scores(NamedTuple):
@@ -253,8 +253,8 @@ def tracking_table(tracks: list[Track]) -> Table:
     header = ("Source", "Controller", "Condition", "Stood", "Time (s)", *(column[0] for column in COLUMNS))
     notes = (
         "The same controller, unmodified, follows targets from any source. `Stood`: runs that ended standing "
-        "of all; `Time`: completed of requested. Errors compare hand and target at the same instant, over the "
-        "steps completed: those of a run that fell early do not compare.",
+        "of all; `Time`: completed of requested. Errors compare hand and target at the same instant, over "
+        "the steps completed: those of a run that fell early do not compare.",
         f"Lag: the shift of the target, up to {MAX_LAG:g} s, with the least root mean square distance to the "
         f"hand (Knapp & Carter 1976), and what is left of that distance; {NONE} where the hand repeats less "
         f"than {FOLLOWS:.0%} of the target's variance.",

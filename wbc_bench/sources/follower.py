@@ -137,7 +137,7 @@ class Follower:
         if anchor is None or anchor[0].frame != target.frame:
             anchor = self._stay(target.frame, seen), device
         (frame, start), origin = anchor
-        moved = Pose(start.pos + device.pos - origin.pos, device.rot @ origin.rot.T @ start.rot)
+        moved = Pose(start.pos + (device.pos - origin.pos), device.rot @ origin.rot.T @ start.rot)
         return _Goal(frame, moved), anchor
 
     def _stay(self, frame: Frame, seen: Seen) -> _Goal:

@@ -4,6 +4,7 @@ A source is asked once a control step: time and what there is to be seen go in, 
 out. A source that needs more of its scene than `Seen` holds (a door, a camera) is given it when it is built.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Literal, NamedTuple, Protocol, get_args
 
@@ -43,7 +44,11 @@ class Source(Protocol):
 
     name: str
     live: bool  # its targets come in real time, so the simulation must keep to it
-    counters: Mapping[str, int]  # what came in, by what became of it; empty where nothing comes in
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """What came in, by what became of it; empty where nothing comes in."""
+        ...
 
     def reset(self, seen: Seen) -> None:
         """A new episode begins; the first target is best where the hand is."""
@@ -83,7 +88,7 @@ def unit(quat_wxyz: Array) -> Array:
 
     Raises: SourceError when it is not even nearly.
     """
-    norm = float(np.linalg.norm(quat_wxyz))
+    norm = math.hypot(*quat_wxyz)  # does not overflow
     if not abs(norm - 1.0) <= UNIT_TOLERANCE:  # so written that NaN is refused
         valid = f"valid: 1 within {UNIT_TOLERANCE:g}"
         raise SourceError(f"quaternion {np.asarray(quat_wxyz).tolist()} has norm {norm:.4g}, {valid}")

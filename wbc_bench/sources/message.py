@@ -11,6 +11,7 @@ from wbc_bench.errors import SourceError
 from wbc_bench.sources.interface import Frame, StampedTarget, unit
 
 MAX_BYTES = 1024  # a message has about 150
+MAX_POSITION = 100.0  # [m] from any origin; far beyond it the motion of a device drowns in rounding
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
@@ -25,7 +26,7 @@ class Fate(enum.StrEnum):
     EARLY = "early"  # sent in the future: the clocks disagree
     REPLAYED = "replayed"  # a sequence number, or a session, that has been before
     OCCUPIED = "occupied"  # another session is being followed
-    FAR = "far"  # too far from the robot, or from where the target is
+    FAR = "far"  # too far from the robot, from where the target is, or from the origin
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -82,4 +83,4 @@ def decode(parts: list[bytes]) -> Message | Fate:
         unit(np.array(message.quat_wxyz))
     except SourceError:
         return Fate.NOT_UNIT
-    return message
+    return Fate.FAR if max(map(abs, message.pos)) > MAX_POSITION else message

@@ -1,4 +1,4 @@
-"""A script sent over the stream: `--source stream:NAME` drives the robot through the socket without a person."""
+"""A script sent over the stream: `--source stream:SCRIPT` goes through the socket without a person."""
 
 import secrets
 import threading

@@ -24,6 +24,13 @@ def is_local(address: str) -> bool:
         return False  # a name, an interface or `*`
 
 
+def has_port(address: str) -> bool:
+    """Whether a TCP address ends in a port; ZeroMQ itself takes 99999 for 34463."""
+    transport, _, rest = address.partition("://")
+    port = rest.rpartition(":")[2]
+    return transport != "tcp" or port == "*" or (port.isdecimal() and int(port) < 1 << 16)
+
+
 class StreamSource:
     """Binds a PULL socket; clients connect with PUSH. Every transmission is read, the latest good one wins.
 
@@ -45,6 +52,10 @@ class StreamSource:
             raise SourceError(
                 f"stream address '{address}' can be reached from other machines, valid: loopback, "
                 f"e.g. {ADDRESS}; --allow-remote opens it to whoever can send there"
+            )
+        if not has_port(address):
+            raise SourceError(
+                f"stream address '{address}' has no port, valid: 0 to 65535, or * for a free one"
             )
         try:
             import zmq
