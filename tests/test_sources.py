@@ -103,7 +103,7 @@ def test_library_keeps_its_limits_and_does_not_jump(name: str) -> None:
     source, seen = load_source(name), seen_at()
     assert isinstance(source, ScriptedSource) and source.name == name
     source.reset(seen)
-    times = np.arange(0.0, source.path.duration + 2 * PERIOD, PERIOD)
+    times = np.arange(0.0, source.path.duration + 2 * PERIOD, PERIOD).tolist()
     poses = [source.path.pose(time) for time in times]
     np.testing.assert_allclose(poses[0].pos, seen.ee_pos_w)
     limits = source.script.limits
@@ -122,7 +122,7 @@ def test_library_is_feasible(name: str, solver: StaticSolver) -> None:
     source = load_source(name)
     assert isinstance(source, ScriptedSource)
     source.reset(seen_at())
-    for time in np.linspace(0.0, source.path.duration, 9):
+    for time in np.linspace(0.0, source.path.duration, 9).tolist():
         pose = source.path.pose(time)
         assert classify(solver, pose.pos, pose.rot) is not None, (time, pose)
 

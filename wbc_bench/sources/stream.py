@@ -48,14 +48,14 @@ class StreamSource:
         """Raises: SourceError when pyzmq is missing, or the address is not local, not valid, or in use."""
         self.name = "stream"
         self.follower = Follower(settings)
+        if not has_port(address):
+            raise SourceError(
+                f"stream address '{address}' has no port, valid: 0 to 65535, or * for a free one"
+            )
         if not allow_remote and not is_local(address):
             raise SourceError(
                 f"stream address '{address}' can be reached from other machines, valid: loopback, "
                 f"e.g. {ADDRESS}; --allow-remote opens it to whoever can send there"
-            )
-        if not has_port(address):
-            raise SourceError(
-                f"stream address '{address}' has no port, valid: 0 to 65535, or * for a free one"
             )
         try:
             import zmq
