@@ -6,6 +6,7 @@ degrees appear on axes only.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -57,6 +58,11 @@ OUTCOME_COLOURS = {
 STRATUM_COLOURS = {"arm": BLUE, "posture": ORANGE, "step": GREEN, "beyond": GREY}
 CONDITION_COLOURS = {"nominal": BLUE, "randomised": VERMILION}
 METHOD_COLOURS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, BLACK)
+# noise and pushes make many lines of one: they stay behind the undisturbed
+CONDITION_LINES: dict[str, dict[str, Any]] = {
+    "nominal": {"lw": 1.4, "zorder": 3},
+    "randomised": {"lw": 0.6, "alpha": 0.45, "zorder": 2},
+}
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # so that curves that coincide both show
 
 
@@ -375,16 +381,18 @@ def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: dict[s
 
     The axis is that of the runs that stood: the error of a robot on its way to the ground says nothing.
     """
-    scale = CM if name == "position_error" else DEG
+    scale, least = (CM, 6.0) if name == "position_error" else (DEG, 6.0)
     stood = [track for track in tracks if track.tracked.outcome == STOOD]
     top = max(np.max(getattr(track.tracked, name), initial=0.0) * scale for track in stood or tracks)
+    top = max(top, least)
     for record, tracked in tracks:
-        line = "-" if record.condition == "nominal" else DASHES[2]
         colour = colours[record.controller]
-        ax.plot(tracked.time, getattr(tracked, name) * scale, ls=line, color=colour, lw=1.2)
+        ax.plot(
+            tracked.time, getattr(tracked, name) * scale, color=colour, **CONDITION_LINES[record.condition]
+        )
         if tracked.outcome != STOOD and len(tracked.time):
             ax.plot(tracked.time[-1], top, "x", color=colour, ms=7, mew=1.6, clip_on=False)
-    ax.set_ylim(0, max(1.08 * top, 0.1))
+    ax.set_ylim(0, 1.08 * top)
     return ax
 
 
@@ -408,8 +416,9 @@ def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
         figure.align_ylabels()
         handles = [Line2D([], [], color=colours[name], label=name) for name in controllers]
         if len(conditions) > 1:
-            styles = {"nominal": "-", "randomised": DASHES[2]}
-            handles += [Line2D([], [], color=GREY, ls=styles[name], label=name) for name in conditions]
+            handles += [
+                Line2D([], [], color=GREY, label=name, **CONDITION_LINES[name]) for name in conditions
+            ]
         if any(track.record.outcome != STOOD for track in tracks):
             handles.append(Line2D([], [], color=GREY, ls="none", marker="x", ms=7, mew=1.6, label="fell"))
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))

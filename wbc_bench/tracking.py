@@ -45,7 +45,7 @@ class Tracked:
 
 
 class Scores(NamedTuple):
-    """One number a run; errors over the steps completed."""
+    """One number a run; errors over the steps completed, the rest NaN unless the robot stood to the end."""
 
     position_mean: float  # [m]
     position_p95: float  # [m]
@@ -53,7 +53,7 @@ class Scores(NamedTuple):
     orientation_p95: float  # [rad]
     lag: float  # [s] NaN where the hand does not follow, or the target does not move
     residual: float  # [m] root mean square of the position error that is left after the lag; NaN likewise
-    sparc: float  # [1] of the hand's speed; NaN after a fall, for the arc length depends on the duration
+    sparc: float  # [1] of the hand's speed; it depends on the duration
     target_sparc: float  # [1] of the target's speed, over the same steps
 
 
@@ -88,8 +88,11 @@ def score(tracked: Tracked) -> Scores:
     position, orientation = tracked.position_error, tracked.orientation_error
     if len(position) == 0:
         return Scores(*[np.nan] * len(Scores._fields))
-    delay, residual = lag(tracked.target_pos_w, tracked.ee_pos_w, tracked.control_period)
-    stood = tracked.outcome == STOOD
+    delay = residual = sparc = target_sparc = np.nan
+    if tracked.outcome == STOOD:  # the way to the ground neither follows nor is smooth
+        target, hand, period = tracked.target_pos_w, tracked.ee_pos_w, tracked.control_period
+        delay, residual = lag(target, hand, period)
+        sparc, target_sparc = smoothness(hand, period), smoothness(target, period)
     return Scores(
         position_mean=float(position.mean()),
         position_p95=float(np.quantile(position, 0.95)),
@@ -97,8 +100,8 @@ def score(tracked: Tracked) -> Scores:
         orientation_p95=float(np.quantile(orientation, 0.95)),
         lag=delay,
         residual=residual,
-        sparc=smoothness(tracked.ee_pos_w, tracked.control_period) if stood else np.nan,
-        target_sparc=smoothness(tracked.target_pos_w, tracked.control_period) if stood else np.nan,
+        sparc=sparc,
+        target_sparc=target_sparc,
     )
 
 
@@ -259,7 +262,7 @@ def tracking_table(tracks: list[Track]) -> Table:
         f"hand (Knapp & Carter 1976), and what is left of that distance; {NONE} where the hand repeats less "
         f"than {FOLLOWS:.0%} of the target's variance.",
         "SPARC: spectral arc length of the speed over the whole run; 0 is smoothest, and it falls with the "
-        "length of a run, so compare a hand with its target. Undefined after a fall.",
+        "length of a run, so compare a hand with its target. Lag and SPARC are undefined after a fall.",
     )
     return Table("tracking", "Tracking of moving targets", header, tuple(rows), notes, pd.DataFrame(data))
 
