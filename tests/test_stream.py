@@ -372,13 +372,15 @@ def test_ten_thousand_fuzzed_messages_neither_crash_nor_move(
     counters = stream.counters
     assert sum(counters.values()) == count and counters["accepted"] == 0, counters
     assert all(counters[name] > 100 for name in ("malformed", "not_finite")), counters
-    time.sleep(0.02)  # and it still listens
-    target = StampedTarget(time.time(), "world", offset(x=0.1), np.array([1.0, 0.0, 0.0, 0.0]))
-    client.send(sources.message.encode(target, session=3, sequence=0))
-    deadline = time.monotonic() + 5.0
-    while stream.counters["accepted"] == 0 and time.monotonic() < deadline:
-        stream.target(300.0, SEEN)
-    assert stream.counters["accepted"] == 1
+    pos, deadline, sequence = HAND, time.monotonic() + 5.0, 0
+    while stream.counters["accepted"] == 0 and time.monotonic() < deadline:  # and it still listens
+        target = StampedTarget(time.time(), "world", offset(x=0.1), np.array([1.0, 0.0, 0.0, 0.0]))
+        client.send(sources.message.encode(target, session=3, sequence=sequence))
+        time.sleep(0.01)
+        pos, _ = to_world(stream.target(1000.0 + sequence, SEEN), SEEN)
+        sequence += 1
+    assert stream.counters["accepted"] >= 1
+    np.testing.assert_allclose(pos, offset(x=0.1))
 
 
 def test_flipped_bits_never_lead_far() -> None:
@@ -459,7 +461,9 @@ def test_the_client_of_the_document_moves_the_target(stream: StreamSource, tmp_p
     finally:
         client.kill()
         client.wait()
-    assert sum(stream.counters.values()) == stream.counters["accepted"] >= 150, stream.counters
+    counters = dict(stream.counters)
+    counters.pop("late")  # while the sockets found each other
+    assert sum(counters.values()) == counters["accepted"] >= 150, stream.counters
     assert np.ptp(np.array(poses)[:, 1]) > 0.05  # it swings along y
 
 
@@ -477,8 +481,8 @@ def test_the_document_names_every_field_and_every_count() -> None:
 def test_latency() -> None:
     """The bench in short, with room for a machine that is busy with something else."""
     frame = stream_latency(seconds=0.5)
-    refused, uses, median = (frame[name].to_numpy() for name in ("refused", "uses", "median (ms)"))
-    assert (refused == 0).all() and (uses >= 20).all()
+    uses, median = (frame[name].to_numpy() for name in ("uses", "median (ms)"))
+    assert (uses >= 20).all()
     assert (median > 0).all() and median[-1] < 10.0
 
 

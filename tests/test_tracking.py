@@ -199,7 +199,8 @@ def test_ik_follows_a_script_and_the_same_script_through_the_stream() -> None:
             np.linalg.norm(np.diff(run.target_pos_w, axis=0), axis=1).sum() > 0.1
         )  # [m] it was led somewhere
         if source.live:
-            assert source.counters["accepted"] == sum(source.counters.values()) > 200
+            refused = {name: n for name, n in source.counters.items() if name not in ("accepted", "late")}
+            assert source.counters["accepted"] > 200 and not any(refused.values())
 
 
 # records, table, figure

@@ -37,28 +37,28 @@ def _row(name: str, rate: float, period: float, seconds: float) -> dict[str, obj
     )
     client.start()
     try:
-        ages = _ages(source, period, seconds)
+        ages, refused = _ages(source, period, seconds)
     finally:
         client.kill()
         client.join()
         source.close()
-    accepted = source.counters["accepted"]
     return {
         "case": name,
         "sent (Hz)": rate,
         "uses": len(ages),
-        "refused": sum(source.counters.values()) - accepted,
+        "refused": refused,
         "median (ms)": 1e3 * float(np.median(ages)),
         "P99 (ms)": 1e3 * float(np.quantile(ages, 0.99)),
         "largest (ms)": 1e3 * float(ages.max()),
     }
 
 
-def _ages(source: StreamSource, period: float, seconds: float) -> np.ndarray:
-    """Age [s] of every newly arrived target at its first use."""
+def _ages(source: StreamSource, period: float, seconds: float) -> tuple[np.ndarray, int]:
+    """Age [s] of every newly arrived target at its first use, and the messages refused meanwhile."""
     source.reset(SEEN)
     while source.counters["accepted"] == 0:  # the client's interpreter starts
         source.target(0.0, SEEN)
+    before = _refused(source)  # what queued up until the sockets had found each other is late
     ages, start, step = [], time.monotonic(), 0
     while time.monotonic() < start + seconds:
         step += 1
@@ -66,7 +66,11 @@ def _ages(source: StreamSource, period: float, seconds: float) -> np.ndarray:
         source.target(step * period, SEEN)
         if not np.isnan(source.follower.latency):
             ages.append(source.follower.latency)
-    return np.array(ages)
+    return np.array(ages), _refused(source) - before
+
+
+def _refused(source: StreamSource) -> int:
+    return sum(source.counters.values()) - source.counters["accepted"]
 
 
 def _send(address: str, rate: float) -> None:
