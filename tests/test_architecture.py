@@ -24,9 +24,23 @@ CHAINS = (
     ("freeze", "targets", "robot"),
     ("freeze", "manifest", "protocol"),
     ("execution", "metrics", "episodes"),
+    ("cli", "track", "sources", "protocol", "robot"),
+    ("track", "control_loop", "observation"),
+    ("publish", "tracking", "store"),
 )
 # Numbers are made of records alone: an analysis runs where neither physics nor learning is installed.
-PURE = ("metrics", "stats", "store", "analysis", "markup", "tables", "plots", "report", "episodes")
+PURE = (
+    "metrics",
+    "stats",
+    "store",
+    "analysis",
+    "markup",
+    "tables",
+    "plots",
+    "report",
+    "episodes",
+    "tracking",
+)
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")
 
 

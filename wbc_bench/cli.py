@@ -171,6 +171,72 @@ class Eval(_Evaluation):
 
 
 @dataclass(frozen=True)
+class Track:
+    """Let controllers follow moving targets, one simulated episode each, and score how."""
+
+    controller: tuple[str, ...] = tyro.MISSING
+    """Controllers: name, name:variant, module:attribute or file.py:attribute."""
+    source: tuple[str, ...] = tyro.MISSING
+    """Sources: a script of the library, a .toml file, `stream`, or `stream:SCRIPT` to send one through it."""
+    duration: float | None = None
+    """Seconds; until the script ends when not given, 20 for a stream."""
+    seed: int = 0
+    """Of the draws of a randomised episode."""
+    condition: str = "nominal"
+    """nominal, or randomised: friction, mass, gains, reset state, pushes and noise of ablation_v1."""
+    address: str = "tcp://127.0.0.1:5601"
+    """Where a stream listens."""
+    allow_remote: FlagCreatePairsOff[bool] = False
+    """Let a stream listen where other machines can reach it."""
+    out: Path = Path("results")
+    """Folder of records, table and figure."""
+
+    def run(self) -> None:
+        from wbc_bench.controller import load_controller
+        from wbc_bench.errors import SourceError
+        from wbc_bench.publish import publish_tracks
+        from wbc_bench.robot import load_robot
+        from wbc_bench.sources.library import find_script, load_source
+        from wbc_bench.store import ResultStore
+        from wbc_bench.track import CONDITIONS, facts, track
+        from wbc_bench.tracking import read_tracks, tracking_table, write_track
+
+        for option, given in (("--controller", self.controller), ("--source", self.source)):
+            if not given:
+                raise UsageError(f"{option}: give at least one")
+        if self.seed < 0:
+            raise UsageError(f"--seed {self.seed}: valid: 0 or more")
+        if self.condition not in CONDITIONS:
+            raise UnknownNameError("condition", self.condition, CONDITIONS, "--condition")
+        for name in self.source:
+            if name != "stream":
+                find_script(name.removeprefix("stream:"))
+        for spec in self.controller:
+            load_controller(spec, load_robot())
+        ResultStore(self.out).probe()
+        for name in dict.fromkeys(self.source):
+            for spec in dict.fromkeys(self.controller):
+                controller = load_controller(spec, load_robot())
+                source = load_source(name, self.address, self.allow_remote)
+                if self.allow_remote and source.live:
+                    print(
+                        f"listening on {self.address}: whoever can send there moves the robot",
+                        file=sys.stderr,
+                    )
+                try:
+                    tracked, asked = track(controller, source, self.condition, self.seed, self.duration)
+                except SourceError as error:
+                    raise UsageError(f"--source {name}: {error}") from error
+                finally:
+                    source.close()
+                what = facts(controller, spec, source, self.condition, self.seed)
+                write_track(self.out, tracked, requested_s=asked, **what)
+        publish_tracks(self.out, self.out)
+        _print_table(tracking_table(read_tracks(self.out)))
+        print(f"record, table and figure are under {self.out}")
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare two evaluated controllers on the episodes that both met."""
 
@@ -215,7 +281,7 @@ class Report:
 
 @dataclass(frozen=True)
 class List:
-    """List controllers, protocols, metrics, benchmarks and runs."""
+    """List controllers, protocols, sources, metrics, benchmarks and runs."""
 
     results: Path = Path("results")
     """Folder of the records."""
@@ -228,6 +294,7 @@ class List:
         from wbc_bench.markup import Table
         from wbc_bench.metrics import METRICS
         from wbc_bench.protocol import find_protocol, protocol_names
+        from wbc_bench.sources.library import find_script, script_names
         from wbc_bench.store import ResultStore
 
         rows = [(name, point.value) for name, point in sorted(controllers().items())]
@@ -241,6 +308,12 @@ class List:
             rows.append((name, size, frozen, protocol.digest[:12], protocol.description))
         header = ("Name", "Replicates x episodes", "Frozen", "Digest", "Description")
         _print_table(Table("protocols", "Protocols", header, tuple(rows)))
+        scripts = [find_script(name) for name in script_names()]
+        rows = [
+            *((script.name, script.path.__struct_config__.tag, script.description) for script in scripts),
+            ("stream", "ZeroMQ", "Targets from another program, see wbc_bench/sources/STREAM.md."),
+        ]
+        _print_table(Table("sources", "Sources", ("Name", "Kind", "Description"), tuple(rows)))
         rows = [(metric.name, metric.unit, metric.better, metric.source) for metric in METRICS]
         _print_table(Table("metrics", "Metrics", ("Name", "Unit", "Better", "Source"), tuple(rows)))
         rows = [(point.name, point.value) for point in entry_points(group=BENCHMARKS)]
@@ -433,6 +506,7 @@ Command = (
     Annotated[Ablation, subcommand("ablation")]
     | Annotated[Reach, subcommand("reach")]
     | Annotated[Eval, subcommand("eval")]
+    | Annotated[Track, subcommand("track")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Report, subcommand("report")]
     | Annotated[List, subcommand("list")]

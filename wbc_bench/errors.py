@@ -36,3 +36,7 @@ class ControllerError(BenchError):
 
 class StoreError(BenchError):
     """A results folder that cannot be used, or records that must not be mixed."""
+
+
+class SourceError(BenchError):
+    """A source of targets that cannot be read or opened, or a target that is none."""

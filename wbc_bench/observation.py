@@ -94,6 +94,11 @@ class Sensors:
 
     def target(self, state: State) -> Target:
         """The target of each episode in its instantaneous base frame."""
-        rot_w = state.base_rot_w
-        pos_b = np.einsum("nji,nj->ni", rot_w, self._rows.target_pos_w - state.base_pos_w)
-        return Target(pos_b, np.swapaxes(rot_w, 1, 2) @ self._target_rot_w)
+        return target_in_base(state, self._rows.target_pos_w, self._target_rot_w)
+
+
+def target_in_base(state: State, pos_w: Array, rot_w: Array) -> Target:
+    """Poses (N, 3), (N, 3, 3) in the world as each base sees them."""
+    base = state.base_rot_w
+    pos_b = np.einsum("nji,nj->ni", base, pos_w - state.base_pos_w)
+    return Target(pos_b, np.swapaxes(base, 1, 2) @ rot_w)

@@ -6,12 +6,14 @@ degrees appear on axes only.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 
@@ -33,6 +35,7 @@ from wbc_bench.analysis import (
 )
 from wbc_bench.episodes import Outcome
 from wbc_bench.tables import CM, DEG, Study, methods_of
+from wbc_bench.tracking import STOOD, Track
 
 STYLE = Path(__file__).with_name("wbc.mplstyle")
 
@@ -55,6 +58,11 @@ OUTCOME_COLOURS = {
 STRATUM_COLOURS = {"arm": BLUE, "posture": ORANGE, "step": GREEN, "beyond": GREY}
 CONDITION_COLOURS = {"nominal": BLUE, "randomised": VERMILION}
 METHOD_COLOURS = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, BLACK)
+# noise and pushes make many lines of one: they stay behind the undisturbed
+CONDITION_LINES: dict[str, dict[str, Any]] = {
+    "nominal": {"lw": 1.4, "zorder": 3},
+    "randomised": {"lw": 0.6, "alpha": 0.45, "zorder": 2},
+}
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # so that curves that coincide both show
 
 
@@ -363,3 +371,56 @@ def write_targets(frame: pd.DataFrame, name: str, out_dir: Path | str) -> list[P
         axes[1, 0].set_ylabel("Left y (m)")
         figure.suptitle(f"{name}: targets (+ start of the base)", x=0.01, ha="left", weight="bold")
         return save(figure, f"{name}_targets", out_dir)
+
+
+# --- moving targets -------------------------------------------------------------------------------------
+
+
+def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: dict[str, str]) -> Axes:
+    """Error over time of every run of one source, `name` as in `Tracked`; a cross at the top where one fell.
+
+    The axis is that of the runs that stood: the error of a robot on its way to the ground says nothing.
+    """
+    scale, least = (CM, 6.0) if name == "position_error" else (DEG, 6.0)
+    stood = [track for track in tracks if track.tracked.outcome == STOOD]
+    top = max(np.max(getattr(track.tracked, name), initial=0.0) * scale for track in stood or tracks)
+    top = max(top, least)
+    for record, tracked in tracks:
+        colour = colours[record.controller]
+        ax.plot(
+            tracked.time, getattr(tracked, name) * scale, color=colour, **CONDITION_LINES[record.condition]
+        )
+        if tracked.outcome != STOOD and len(tracked.time):
+            ax.plot(tracked.time[-1], top, "x", color=colour, ms=7, mew=1.6, clip_on=False)
+    ax.set_ylim(0, 1.08 * top)
+    return ax
+
+
+def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
+    """Error over time as `tracking`: a row a source, position left, orientation right."""
+    sources = list(dict.fromkeys(track.record.source for track in tracks))
+    controllers = sorted({track.record.controller for track in tracks})
+    colours = dict(zip(controllers, METHOD_COLOURS * len(controllers), strict=False))
+    conditions = sorted({track.record.condition for track in tracks})
+    with _styled():
+        figure = Figure(figsize=(8.0, 0.9 + 1.45 * len(sources)))
+        axes = figure.subplots(len(sources), 2, squeeze=False)
+        for row, source in zip(axes, sources, strict=True):
+            own = [track for track in tracks if track.record.source == source]
+            tracking_error(row[0], own, "position_error", colours).set(title=source, ylabel="Position (cm)")
+            tracking_error(row[1], own, "orientation_error", colours).set(ylabel="Orientation (deg)")
+            for ax in row:
+                ax.set_xlim(0, max(track.record.requested_s for track in own))
+        for ax in axes[-1]:
+            ax.set_xlabel("Time (s)")
+        figure.align_ylabels()
+        handles = [Line2D([], [], color=colours[name], label=name) for name in controllers]
+        if len(conditions) > 1:
+            handles += [
+                Line2D([], [], color=GREY, label=name, **CONDITION_LINES[name]) for name in conditions
+            ]
+        if any(track.record.outcome != STOOD for track in tracks):
+            handles.append(Line2D([], [], color=GREY, ls="none", marker="x", ms=7, mew=1.6, label="fell"))
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+        figure.suptitle("Error of the hand while its target moves", x=0.01, ha="left", weight="bold")
+        return save(figure, "tracking", out_dir)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from wbc_bench import plots, report, tables
+from wbc_bench import plots, report, tables, tracking
 from wbc_bench.errors import StoreError
 from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.protocol import PROTOCOL_DIR, ReachTargets, load_protocol, protocol_names
@@ -20,7 +20,8 @@ def publish(store: ResultStore, out: Path) -> list[Path]:
     Raises: StoreError when the store has no run, mixes digests, or the folder cannot be written.
     """
     protocols = sorted({run.record.protocol for run in store.runs()})
-    if not protocols:
+    tracks = tracking.read_tracks(store.root)
+    if not protocols and not tracks:
         raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -28,12 +29,24 @@ def publish(store: ResultStore, out: Path) -> list[Path]:
             made = Path(folder)
             for protocol in protocols:
                 _write_protocol(store, protocol, made)
+            _write_tracks(tracks, made)
             report.write(store, made)
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))
                 if path.is_file()
             ]
+    except OSError as error:
+        raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
+
+
+def publish_tracks(root: Path, out: Path) -> list[Path]:
+    """Write the table and the figure of the tracks under `root` alone.
+
+    Raises: StoreError when a track cannot be read or the folder cannot be written.
+    """
+    try:
+        return _write_tracks(tracking.read_tracks(root), out)
     except OSError as error:
         raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
 
@@ -56,6 +69,13 @@ def _write_protocol(store: ResultStore, name: str, out: Path) -> None:
     if released:
         manifest, _ = read_manifest(released, manifest_path(PROTOCOL_DIR / f"{name}.toml"))
         plots.write_targets(target_frame(manifest), name, out / "figures")
+
+
+def _write_tracks(tracks: list[tracking.Track], out: Path) -> list[Path]:
+    if not tracks:
+        return []
+    paths = tracking.tracking_table(tracks).write(out / "tables")
+    return paths + plots.write_tracking(tracks, out / "figures")
 
 
 def _move(source: Path, destination: Path) -> Path:

@@ -104,11 +104,13 @@ def write(store: StoreLike, results_dir: Path | str) -> Path:
     # A section a protocol: its files begin with its name, and the longest such name owns a file.
     protocols = sorted({run.record.protocol for run in runs})
 
+    parts_of_report = [*protocols, "tracking"]
+
     def owner(stem: str) -> str:
-        return max((p for p in protocols if stem == p or stem.startswith(f"{p}_")), key=len, default="")
+        return max((p for p in parts_of_report if stem == p or stem.startswith(f"{p}_")), key=len, default="")
 
     sections = []
-    for protocol in [*protocols, ""]:
+    for protocol in [*parts_of_report, ""]:
         own = sorted((path for path in tables if owner(path.stem) == protocol), key=_order)
         shown = [read_markdown(path).html() for path in own]
         images = [figure_html(_figure(root, stem)) for stem in figures if owner(stem) == protocol]

@@ -1,0 +1,102 @@
+"""A shard of episodes under one controller, a control step at a time; the targets are the caller's."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wbc_bench.controller import Controller, Target
+from wbc_bench.episodes import Outcome
+from wbc_bench.errors import ControllerError
+from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.observation import Sensors
+from wbc_bench.protocol import EvalProtocol
+from wbc_bench.robot import NUM_JOINTS
+from wbc_bench.simulation import Simulation, State
+
+RUNNING = ""
+
+
+class Taken(NamedTuple):
+    """What happened in one control step."""
+
+    ran: NDArray[np.bool_]  # (N,) episodes that were stepped, those that ended by it included
+    q: NDArray[np.float64]  # (N, 14) [rad] commands
+    infeasible: NDArray[np.bool_] | None  # (N,) as the controller said
+
+
+class ControlLoop:
+    """Observe, act, push, step, and end what has fallen. `state` and `observation` are the present ones."""
+
+    def __init__(self, controller: Controller, protocol: EvalProtocol, rows: EpisodeManifest) -> None:
+        """Raises: ControllerError when the control period is not the protocol's."""
+        period, count = protocol.control_period, len(rows)
+        if abs(controller.info.control_period - period) > 1e-9:
+            raise ControllerError(
+                f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "
+                f"protocol {protocol.name} asks for {period:g} s"
+            )
+        self._controller, self._protocol, self._rows = controller, protocol, rows
+        self.simulation = Simulation(protocol, rows)
+        self.sensors = Sensors(protocol, rows, controller.info.signals)
+        self._push_step = np.full(rows.push_time.shape, -1)
+        planned = np.isfinite(rows.push_time)
+        self._push_step[planned] = np.round(rows.push_time[planned] / period)
+        self._push_vel = rows.push_vel.reshape(count, -1, 2)
+
+        self.step = 0  # control steps taken
+        self.ended = np.full(count, RUNNING, dtype=object)  # (N,) how, or RUNNING
+        self.active = np.ones(count, dtype=bool)
+        self.state: State = self.simulation.state()
+        self.observation = self.sensors.observe(0, 0.0, self.state, self.active)
+
+    def reset(self, target: Target) -> None:
+        """Tell the controller what it begins with."""
+        self._controller.reset(self._rows.episode, self.observation, target)
+
+    def advance(self, target: Target) -> Taken:
+        """One control step towards a target.
+
+        Raises: ControllerError when the command has the wrong shape.
+        """
+        command, active = self._controller.act(self.observation, target), self.active
+        q = np.asarray(command.q)
+        if q.shape != (len(active), NUM_JOINTS):
+            raise ControllerError(
+                f"controller '{self._controller.info.name}' returned commands of shape {q.shape}, "
+                f"expected ({len(active)}, {NUM_JOINTS})"
+            )
+        finite = np.isfinite(q).all(axis=1)
+        self.ended[active & ~finite] = Outcome.INVALID
+        active &= finite
+        taken = Taken(active.copy(), q, command.infeasible)
+        if active.any():
+            self._move(q, active)
+        return taken
+
+    def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_]) -> None:
+        pushed = self._push_step == self.step
+        if pushed.any():
+            mask = pushed[..., None] & active[:, None, None]
+            self.simulation.push(np.where(mask, self._push_vel, 0.0).sum(axis=1))
+        self.simulation.step(q, active)
+        self.state = self.simulation.state()
+        self.step += 1
+        for outcome, where in _terminations(self._protocol, self.state):
+            self.ended[active & where] = outcome
+            active &= ~where
+        if active.any():
+            time = self.step * self._protocol.control_period  # [s]
+            self.observation = self.sensors.observe(self.step, time, self.state, active)
+
+
+def _terminations(protocol: EvalProtocol, state: State) -> list[tuple[Outcome, NDArray[np.bool_]]]:
+    """Ways an episode ends early; the first that holds counts. Source: the paper, made deterministic."""
+    limits = protocol.termination
+    tilted = state.base_rot_w[:, 2, 2] < np.cos(limits.tilt)
+    low = state.base_pos_w[:, 2] < limits.base_height
+    return [
+        (Outcome.INVALID, state.diverged),
+        (Outcome.ILLEGAL_CONTACT, state.ground_contact & limits.illegal_contact),
+        (Outcome.FELL, tilted | low),
+    ]

@@ -1,0 +1,155 @@
+"""One simulated episode driven by a source instead of a manifest: what `wbc-bench track` runs."""
+
+import math
+import time as clocks
+from datetime import UTC, datetime
+
+import msgspec
+import numpy as np
+
+from wbc_bench import provenance
+from wbc_bench.control_loop import RUNNING, ControlLoop
+from wbc_bench.controller import Controller
+from wbc_bench.errors import SourceError, UnknownNameError
+from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.observation import target_in_base
+from wbc_bench.protocol import EvalProtocol, find_protocol
+from wbc_bench.randomization import draw, undisturbed
+from wbc_bench.robot import Robot, load_robot, mount_of
+from wbc_bench.rotations import geodesic_angle
+from wbc_bench.simulation import Simulation, State
+from wbc_bench.sources.interface import Seen, Source, to_world
+from wbc_bench.sources.player import PlayedStream
+from wbc_bench.sources.scripted import ScriptedSource
+from wbc_bench.tracking import STOOD, Tracked
+
+CONDITIONS = ("nominal", "randomised")
+BASE_PROTOCOL = "ablation_v1"  # whose physics, randomisation, noise, pushes and limits hold
+UNSCRIPTED = 20.0  # [s] for a source that has no end
+STAY = 2.0  # [s] after the end of a script
+
+
+def track(
+    controller: Controller, source: Source, condition: str, seed: int, duration: float | None = None
+) -> tuple[Tracked, float]:
+    """Let a controller follow a source for `duration` [s], by default until the script ends; on this thread.
+
+    Returns: the series, and the seconds asked for.
+
+    Raises:
+        UnknownNameError: no such condition.
+        SourceError: a duration that is not positive.
+        ControllerError: see `ControlLoop`.
+    """
+    if condition not in CONDITIONS:
+        raise UnknownNameError("condition", condition, CONDITIONS, "--condition")
+    if duration is None:
+        duration = natural_duration(source)
+    protocol = _protocol(duration, seed)
+    if not math.isfinite(duration) or protocol.num_steps < 1:
+        raise SourceError(f"duration {duration:g} s, valid: {protocol.control_period:g} s or more")
+    return follow(controller, source, protocol, _row(protocol, condition)), duration
+
+
+def follow(controller: Controller, source: Source, protocol: EvalProtocol, row: EpisodeManifest) -> Tracked:
+    """The series of one episode (a manifest of one row, whose target nobody looks at)."""
+    period = protocol.control_period
+    loop = ControlLoop(controller, protocol, row)
+    robot = loop.simulation.robot
+    seen = seen_of(loop.state, robot)
+    source.reset(seen)
+    target_pos_w, ee_pos_w, position, orientation = [], [], [], []
+    start = clocks.monotonic()
+    for step in range(protocol.num_steps):
+        if source.live:
+            clocks.sleep(max(0.0, start + step * period - clocks.monotonic()))
+        pos_w, rot_w = to_world(source.target(step * period, seen), seen)
+        target = target_in_base(loop.state, pos_w[None], rot_w[None])
+        if step == 0:
+            loop.reset(target)
+        if not loop.advance(target).ran.any():
+            break
+        target_pos_w.append(pos_w)
+        ee_pos_w.append(seen.ee_pos_w)
+        position.append(np.linalg.norm(seen.ee_pos_w - pos_w))
+        orientation.append(geodesic_angle(seen.ee_rot_w, rot_w))
+        if not loop.active.any():
+            break
+        seen = seen_of(loop.state, robot)
+    ended = loop.ended[0]
+    return Tracked(
+        control_period=period,
+        outcome=STOOD if ended == RUNNING else str(ended),
+        target_pos_w=np.reshape(target_pos_w, (-1, 3)),
+        ee_pos_w=np.reshape(ee_pos_w, (-1, 3)),
+        position_error=np.array(position, dtype=float),
+        orientation_error=np.array(orientation, dtype=float),
+    )
+
+
+def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
+    """One row of a state, as a source sees it."""
+    return Seen(
+        ee_pos_w=state.ee_pos_w[index],
+        ee_rot_w=state.ee_rot_w[index],
+        base_pos_w=state.base_pos_w[index],
+        base_rot_w=state.base_rot_w[index],
+        arm_mount_b=np.array(mount_of(robot.facts, robot.config).xyz),
+    )
+
+
+def natural_duration(source: Source) -> float:
+    """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources."""
+    script = source.script if isinstance(source, ScriptedSource | PlayedStream) else None
+    if script is None:
+        return UNSCRIPTED
+    protocol = _protocol(UNSCRIPTED, seed=0)
+    state = Simulation(protocol, _row(protocol, "nominal")).state()
+    played = ScriptedSource(script)
+    played.reset(seen_of(state, load_robot(protocol.robot)))
+    return math.ceil(played.path.duration + STAY)
+
+
+def facts(controller: Controller, spec: str, source: Source, condition: str, seed: int) -> dict:
+    """What the record of a run says beside its series."""
+    commit = provenance.commit()
+    return {
+        "source": source.name,
+        "source_sha256": source.script.digest if isinstance(source, ScriptedSource | PlayedStream) else None,
+        "controller": spec,
+        "signals": sorted(controller.info.signals),
+        "condition": condition,
+        "seed": seed,
+        "counters": dict(source.counters),
+        "software_sha256": provenance.software_digest(controller),
+        "git_commit": commit.sha,
+        "git_dirty": commit.dirty,
+        "versions": provenance.versions(),
+        "machine": provenance.machine(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _protocol(duration: float, seed: int) -> EvalProtocol:
+    protocol, _ = find_protocol(BASE_PROTOCOL)
+    episodes = msgspec.structs.replace(
+        protocol.episodes, replicates=1, per_replicate=1, horizon=duration, seed=seed
+    )
+    return msgspec.structs.replace(protocol, name="track", episodes=episodes)
+
+
+def _row(protocol: EvalProtocol, condition: str) -> EpisodeManifest:
+    draws = (draw if condition == "randomised" else undisturbed)(protocol, 0, 0)
+    columns = {name: np.array([value]) for name, value in draws._asdict().items()}
+    labels = {name: np.array([""], dtype=object) for name in ("stratum", "orientation")}
+    return EpisodeManifest(
+        replicate=np.zeros(1, dtype=np.int64),
+        episode=np.zeros(1, dtype=np.int64),
+        condition=np.array([condition], dtype=object),
+        height=np.full(1, np.nan),
+        target_pos_w=np.full((1, 3), np.nan),
+        target_quat_w=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        witness_qpos=np.full((1, 21), np.nan),
+        **labels,
+        **columns,
+    )

@@ -1,0 +1,276 @@
+"""What a tracked source leaves behind: time series, their scores, records on disk, and the table of them.
+
+<root>/tracks/<source>/<controller>/<condition>_<seed>/track.json, series.parquet
+"""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from wbc_bench.errors import StoreError
+from wbc_bench.markup import Table
+from wbc_bench.metrics import spectral_arc_length
+from wbc_bench.store import folder_name, write_atomic
+
+Array = NDArray[np.float64]
+STOOD = "stood"  # the outcome of a run to its end; otherwise one of episodes.TERMINATED
+MAX_LAG = 3.0  # [s] a longer one is not following
+FOLLOWS = 0.5  # of the target's variance that the hand must repeat for its lag to mean anything; choice
+CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """T control steps of one episode: the target as it was handed over, and the hand at that moment."""
+
+    control_period: float  # [s]
+    outcome: str  # STOOD or one of episodes.TERMINATED
+    target_pos_w: Array  # (T, 3) [m]
+    ee_pos_w: Array  # (T, 3) [m]
+    position_error: Array  # (T,) [m]
+    orientation_error: Array  # (T,) [rad] geodesic
+
+    @property
+    def time(self) -> Array:
+        """(T,) [s]"""
+        return self.control_period * np.arange(len(self.position_error), dtype=np.float64)
+
+
+class Scores(NamedTuple):
+    """One number a run; errors over the steps completed, the rest NaN unless the robot stood to the end."""
+
+    position_mean: float  # [m]
+    position_p95: float  # [m]
+    orientation_mean: float  # [rad]
+    orientation_p95: float  # [rad]
+    lag: float  # [s] NaN where the hand does not follow, or the target does not move
+    residual: float  # [m] root mean square of the position error that is left after the lag; NaN likewise
+    sparc: float  # [1] of the hand's speed; it depends on the duration
+    target_sparc: float  # [1] of the target's speed, over the same steps
+
+
+def lag(target: Array, hand: Array, period: float) -> tuple[float, float]:
+    """The delay [s] that explains the hand (T, 3) best as the target (T, 3), and the RMS distance [m] then.
+
+    The shift of the target, in whole steps, with the least root mean square distance. Source: Knapp & Carter
+    1976, IEEE Trans. ASSP 24(4); the least-squares shift is that of the largest cross-correlation as far as
+    the energy inside the window does not change with the shift.
+
+    Returns: NaN, NaN when the best shift leaves more than 1 - FOLLOWS of the target's variance, or is the
+    largest.
+    """
+    most = round(MAX_LAG / period)
+    if len(target) < 2 * most:
+        return np.nan, np.nan
+    # the same instants of the hand at every shift, or a shift could win by dropping a hard part
+    late = hand[most:]
+    squares = np.array(
+        [((late - target[most - k : len(target) - k]) ** 2).sum(axis=1).mean() for k in range(most + 1)]
+    )  # (K,) [m^2]
+    best = int(squares.argmin())
+    asked = target[most - best : len(target) - best]
+    variance = ((asked - asked.mean(axis=0)) ** 2).sum(axis=1).mean()  # [m^2]
+    if best == most or not squares[best] < (1 - FOLLOWS) * variance:
+        return np.nan, np.nan
+    return best * period, float(np.sqrt(squares[best]))
+
+
+def score(tracked: Tracked) -> Scores:
+    """The scores of a run; NaN without a step."""
+    position, orientation = tracked.position_error, tracked.orientation_error
+    if len(position) == 0:
+        return Scores(*[np.nan] * len(Scores._fields))
+    delay = residual = sparc = target_sparc = np.nan
+    if tracked.outcome == STOOD:  # the way to the ground neither follows nor is smooth
+        target, hand, period = tracked.target_pos_w, tracked.ee_pos_w, tracked.control_period
+        delay, residual = lag(target, hand, period)
+        sparc, target_sparc = smoothness(hand, period), smoothness(target, period)
+    return Scores(
+        position_mean=float(position.mean()),
+        position_p95=float(np.quantile(position, 0.95)),
+        orientation_mean=float(orientation.mean()),
+        orientation_p95=float(np.quantile(orientation, 0.95)),
+        lag=delay,
+        residual=residual,
+        sparc=sparc,
+        target_sparc=target_sparc,
+    )
+
+
+def smoothness(pos: Array, period: float) -> float:
+    """Spectral arc length [1] of the speed along (T, 3) [m]; 0 is smoothest. Source: see `metrics`."""
+    if len(pos) < 3:
+        return np.nan
+    speed = np.linalg.norm(np.diff(pos, axis=0), axis=1) / period  # [m/s]
+    return float(spectral_arc_length(speed[None], 1.0 / period)[0])
+
+
+# --- records --------------------------------------------------------------------------------------------
+
+
+class TrackRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """What was run, and where the series beside it come from."""
+
+    source: str
+    source_sha256: str | None  # of a script; a stream or a person has none
+    controller: str  # the spec as it was given
+    signals: list[str]
+    condition: str
+    seed: int
+    requested_s: float  # [s]
+    completed_s: float  # [s]
+    outcome: str
+    control_period: float  # [s]
+    counters: dict[str, int]  # of messages, by what became of them
+    series_sha256: str  # of series.parquet
+    software_sha256: str
+    git_commit: str | None
+    git_dirty: bool
+    versions: dict[str, str]
+    machine: dict[str, str | int | float]
+    created: str  # UTC, ISO 8601
+
+
+class Track(NamedTuple):
+    """A run on disk."""
+
+    record: TrackRecord
+    tracked: Tracked
+
+
+def write_track(root: Path, tracked: Tracked, **facts) -> Path:
+    """Write a run, replacing an earlier one of the same source, controller, condition and seed.
+
+    Raises: StoreError when the folder cannot be written.
+    """
+    columns = {f"target_{axis}": tracked.target_pos_w[:, k] for k, axis in enumerate("xyz")}
+    columns |= {f"ee_{axis}": tracked.ee_pos_w[:, k] for k, axis in enumerate("xyz")}
+    columns |= {
+        "position_error": tracked.position_error,
+        "orientation_error": tracked.orientation_error,
+    }
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.table(columns), sink, compression="zstd", use_dictionary=False)
+    data = sink.getvalue().to_pybytes()
+    record = TrackRecord(
+        completed_s=round(len(tracked.position_error) * tracked.control_period, 9),
+        outcome=tracked.outcome,
+        control_period=tracked.control_period,
+        series_sha256=hashlib.sha256(data).hexdigest(),
+        **facts,
+    )
+    name = f"{record.condition}_{record.seed}"
+    folder = root / "tracks" / folder_name(record.source) / folder_name(record.controller) / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot create '{folder}': {error.strerror}") from error
+    write_atomic(folder / "series.parquet", data)
+    text = msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
+    write_atomic(folder / "track.json", text)
+    return folder
+
+
+def read_tracks(root: Path) -> list[Track]:
+    """Every run under a folder, sorted by source, controller, condition and seed.
+
+    Raises: StoreError when one cannot be read or its series are not those it was written with.
+    """
+    tracks = [_read(path) for path in root.glob("tracks/*/*/*/track.json")]
+    return sorted(tracks, key=lambda track: _key(track.record))
+
+
+def _key(record: TrackRecord) -> tuple[str, str, str, int]:
+    return record.source, record.controller, record.condition, record.seed
+
+
+def _read(path: Path) -> Track:
+    series = path.with_name("series.parquet")
+    try:
+        record = msgspec.json.decode(path.read_bytes(), type=TrackRecord)
+        data = series.read_bytes()
+    except (OSError, msgspec.MsgspecError) as error:
+        raise StoreError(f"cannot read track '{path}': {error}") from error
+    if hashlib.sha256(data).hexdigest() != record.series_sha256:
+        raise StoreError(f"'{series}' is not what its track.json was written for: another sha256")
+    frame = pq.read_table(pa.BufferReader(data)).to_pandas()
+
+    def columns(*names: str) -> Array:
+        return frame[list(names)].to_numpy(dtype=float)
+
+    tracked = Tracked(
+        control_period=record.control_period,
+        outcome=record.outcome,
+        target_pos_w=columns("target_x", "target_y", "target_z"),
+        ee_pos_w=columns("ee_x", "ee_y", "ee_z"),
+        position_error=columns("position_error")[:, 0],
+        orientation_error=columns("orientation_error")[:, 0],
+    )
+    return Track(record, tracked)
+
+
+# --- table ----------------------------------------------------------------------------------------------
+
+COLUMNS = (  # header, score, scale, digits
+    ("Pos. mean ↓ (cm)", "position_mean", CM, 2),
+    ("Pos. P95 ↓ (cm)", "position_p95", CM, 2),
+    ("Ori. mean ↓ (deg)", "orientation_mean", DEG, 2),
+    ("Ori. P95 ↓ (deg)", "orientation_p95", DEG, 2),
+    ("Lag ↓ (s)", "lag", 1.0, 2),
+    ("Pos. after lag ↓ (cm)", "residual", CM, 2),
+    ("SPARC ↑", "sparc", 1.0, 1),
+    ("SPARC of target", "target_sparc", 1.0, 1),
+)
+NONE = "–"
+
+
+def tracking_table(tracks: list[Track]) -> Table:
+    """Controllers x sources; a row is the mean over the seeds of one condition."""
+    groups: dict[tuple[str, str, str], list[Track]] = {}
+    for track in tracks:
+        groups.setdefault(_key(track.record)[:3], []).append(track)
+    rows, data, before = [], [], None
+    for (source, controller, condition), runs in groups.items():
+        values = {name: _mean([getattr(score(run.tracked), name) for run in runs]) for name in Scores._fields}
+        stood = sum(run.record.outcome == STOOD for run in runs)
+        completed, requested = (
+            sum(getattr(run.record, f"{what}_s") for run in runs) for what in ("completed", "requested")
+        )
+        cells = (_cell(values[name] * scale, digits) for _, name, scale, digits in COLUMNS)
+        counts = f"{stood}/{len(runs)}", f"{completed:.1f}/{requested:.1f}"
+        rows.append((source if source != before else "", f"`{controller}`", condition, *counts, *cells))
+        before = source
+        data.append(
+            {"source": source, "controller": controller, "condition": condition, "runs": len(runs)}
+            | {"stood": stood, "completed_s": completed, "requested_s": requested}
+            | {f"{name}_avg": value for name, value in values.items()}
+        )
+    header = ("Source", "Controller", "Condition", "Stood", "Time (s)", *(column[0] for column in COLUMNS))
+    notes = (
+        "The same controller, unmodified, follows targets from any source. `Stood`: runs that ended standing "
+        "of all; `Time`: completed of requested. Errors compare hand and target at the same instant, over "
+        "the steps completed: those of a run that fell early do not compare.",
+        f"Lag: the shift of the target, up to {MAX_LAG:g} s, with the least root mean square distance to the "
+        f"hand (Knapp & Carter 1976), and what is left of that distance; {NONE} where the hand repeats less "
+        f"than {FOLLOWS:.0%} of the target's variance.",
+        "SPARC: spectral arc length of the speed over the whole run; 0 is smoothest, and it falls with the "
+        "length of a run, so compare a hand with its target. Lag and SPARC are undefined after a fall.",
+    )
+    return Table("tracking", "Tracking of moving targets", header, tuple(rows), notes, pd.DataFrame(data))
+
+
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else np.nan
+
+
+def _cell(value: float, digits: int) -> str:
+    return NONE if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
