@@ -246,7 +246,7 @@ def test_the_controller_sends_the_torques_of_static_balance() -> None:
     obs, target = _observation(1, q)
     controller.reset(np.arange(1), obs, target)
     episode = controller._episodes[0]
-    torques = controller._balance(episode, q, pin.Quaternion(q[3:7]).toRotationMatrix(), np.zeros(3))
+    torques = controller._balance(episode, q, pin.Quaternion(q[3:7]).toRotationMatrix(), np.zeros(3), (0, 1))
     np.testing.assert_allclose(episode.acceleration, 0.0, atol=1e-3)
     q, generalized = carried()
     np.testing.assert_allclose(torques, (MODEL.gravity_torques(q) - generalized)[6:], atol=1e-3)
