@@ -26,7 +26,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Take samples (..., size) into account. Source: Chan, Golub and LeVeque 1979 (merging two samples)."""
+        """Take samples (..., size) into account. Source: Chan, Golub, LeVeque 1979."""
         x = x.reshape(-1, self.mean.shape[0])
         count = self.count + len(x)
         weight = (len(x) / count).to(self.mean.dtype)  # of the new samples

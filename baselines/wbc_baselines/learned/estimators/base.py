@@ -4,8 +4,6 @@ from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
-from wbc_baselines.learned.normalizer import Normalizer
-
 
 class Batch(NamedTuple):
     """A rollout of N robots over T control steps, time first; nothing in it carries a gradient."""
@@ -42,7 +40,4 @@ class Estimator(nn.Module):
         raise NotImplementedError
 
     def observe(self, history: Tensor) -> None:
-        """Take the newest terms of windows (..., HISTORY, 57) into the input normaliser; training calls it."""
-        normalizer = getattr(self, "normalizer", None)
-        if isinstance(normalizer, Normalizer):
-            normalizer.update(history[..., -1, :])
+        """Take the newest terms of windows (..., HISTORY, 57) into the input normaliser, in training."""
