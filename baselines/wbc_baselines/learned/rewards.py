@@ -103,7 +103,7 @@ class Gates(NamedTuple):
 # U(0.5, 1.4) (`mean_gate`; a test works it out again); the scores, the means of s~ over the part of an
 # episode where their gate is open, E[(1 - g) s~_m] / E[1 - g] and E[g s~_l] / E[g], were measured on a policy
 # trained with the gated reward (the log's gate/... columns).
-PHASE = 0.103
+PHASE = 0.1915
 SCORE_M = 1.05
 SCORE_L = 0.95
 ADDITIVE = Gates(

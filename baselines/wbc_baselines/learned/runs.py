@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +16,7 @@ from wbc_baselines.learned.settings import Settings, TrainingError
 if TYPE_CHECKING:
     from wbc_baselines.learned.training import Trainer
 
-CHECKPOINT_PERIOD = 180.0  # [s] between resume files: what a kill can cost
+CHECKPOINT_PERIOD = 90.0  # [s] between resume files: what a kill can cost
 STALE = 900.0  # [s] without a sign of life after which a claim may be taken over
 FREE = frozenset({"budget", "threads"})  # settings that may differ when a run goes on
 
@@ -196,25 +198,46 @@ def run(
         saved = time.monotonic()
         writer = _writer(folder, trainer.iteration) if tensorboard else None
         per_iteration = settings.envs * settings.steps
-        while not trainer.done:
-            metrics = trainer.iterate()
-            seconds = time.monotonic() - started
-            rate = per_iteration / sum(metrics[f"time/{part}"] for part in ("rollout", "policy", "estimator"))
-            row = {"iteration": trainer.iteration, "samples": trainer.samples, "seconds": seconds}
-            folder.append(row | {k: None if v != v else float(v) for k, v in metrics.items()})
-            if writer:
-                for name, value in metrics.items():
-                    writer.add_scalar(name, value, trainer.samples)
-            progress(trainer.samples - first, settings.budget - first, line(trainer, metrics, rate))
-            if time.monotonic() - saved > CHECKPOINT_PERIOD or trainer.done:
-                save_resume(trainer, folder, seconds)
-                saved = time.monotonic()
-                folder.touch()
+        with _stop_requests() as stop:
+            while not trainer.done:
+                metrics = trainer.iterate()
+                seconds = time.monotonic() - started
+                rate = per_iteration / sum(metrics[f"time/{k}"] for k in ("rollout", "policy", "estimator"))
+                row = {"iteration": trainer.iteration, "samples": trainer.samples, "seconds": seconds}
+                folder.append(row | {k: None if v != v else float(v) for k, v in metrics.items()})
+                if writer:
+                    for name, value in metrics.items():
+                        writer.add_scalar(name, value, trainer.samples)
+                progress(trainer.samples - first, int(settings.budget) - first, line(trainer, metrics, rate))
+                if stop or trainer.done or time.monotonic() - saved > CHECKPOINT_PERIOD:
+                    save_resume(trainer, folder, seconds)
+                    saved = time.monotonic()
+                    folder.touch()
+                if stop:
+                    raise KeyboardInterrupt
         finish(trainer, folder, time.monotonic() - started)
         if writer:
             writer.close()
     finally:
         folder.release()
+
+
+@contextmanager
+def _stop_requests() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop, so that it can save first; a second ask is obeyed."""
+    asked: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def line(trainer: "Trainer", metrics: dict[str, float], rate: float) -> str:

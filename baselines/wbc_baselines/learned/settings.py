@@ -1,5 +1,6 @@
 """The settings of a training run."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +20,7 @@ class Settings:
     """A method of the study: no_latent, cenet, gru, transformer, transformer_gru, oracle, ..."""
     seed: int = 0
     """Seed of weights and draws."""
-    budget: int = 60_000_000
+    budget: float = 60e6
     """Control steps to train on, over all environments."""
     protocol: str = "ablation_v1"
     """Whose targets, randomisation, noise, pushes and terminations are trained on."""
@@ -27,9 +28,9 @@ class Settings:
     """Environments side by side."""
     steps: int = 24
     """Control steps of a rollout."""
-    epochs: int = 5
+    epochs: int = 2
     """Passes of PPO over a rollout."""
-    minibatches: int = 4
+    minibatches: int = 8
     """Parts of a rollout in one pass."""
     learning_rate: float = 3e-4
     """At the start; then adapted to `desired_kl`."""
@@ -57,7 +58,7 @@ class Settings:
     """Physics steps in a control period."""
     curriculum: float = 0.0
     """Part of the budget over which the strata ramp from mostly `arm` to the protocol's weights."""
-    estimator_share: float = 0.25
+    estimator_share: float = 0.125
     """Part of the environments whose rollouts train the estimator; drawn anew each iteration."""
     estimator_minibatches: int = 4
     """Updates of the estimator in an iteration, each on whole rollouts of its own environments."""
@@ -76,7 +77,7 @@ class Settings:
     @property
     def iterations(self) -> int:
         """Whole rollouts that reach the budget."""
-        return -(-self.budget // (self.envs * self.steps))
+        return math.ceil(self.budget / (self.envs * self.steps))
 
     def check(self) -> None:
         """Refuse what cannot be run.
