@@ -12,6 +12,8 @@ from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
+# on these MuJoCo resets the simulation or zeroes its controls, and goes on as if nothing had happened
+_FATAL = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC", "CTRL")]
 _STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
 _MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
 
@@ -79,6 +81,7 @@ class CpuBackend:
         sensor = take(self._out["sensordata"])
         tcp, soles = self._sites[0], self._sites[1:]
         sound = (qvel.abs() < MAX_SPEED).all(-1) & qpos.isfinite().all(-1)
+        fatal = torch.from_numpy((self._batch.warning[ids][:, _FATAL, 1] > 0).any(1))
         return State(
             qpos=qpos,
             qvel=qvel,
@@ -89,7 +92,7 @@ class CpuBackend:
             feet_up_w=rot[:, soles, :2, 2].contiguous(),
             foot_force_w=sensor[:, self._soles].unflatten(-1, (2, 3)),
             ground_contact=(sensor[:, self._ground] > 0).any(-1),
-            diverged=~sound,
+            diverged=~sound | fatal,
         )
 
     def save(self) -> dict[str, NDArray]:
