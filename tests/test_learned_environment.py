@@ -2,12 +2,15 @@
 
 import hashlib
 from dataclasses import fields
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
+
+from torch import Tensor  # noqa: E402
 
 from wbc_baselines.learned import inputs  # noqa: E402
 from wbc_baselines.learned.backends.base import Start  # noqa: E402
@@ -37,19 +40,21 @@ def coarse(protocol: EvalProtocol = PROTOCOL, **changes) -> EvalProtocol:
     return msgspec.structs.replace(protocol, physics=physics, **changes)
 
 
-def environment(protocol: EvalProtocol | None = None, count: int = N, seed: int = 0, threads: int = 1) -> Environment:
+def environment(
+    protocol: EvalProtocol | None = None, count: int = N, seed: int = 0, threads: int = 1
+) -> Environment:
     protocol = protocol or coarse()
     return Environment(protocol, CpuBackend(protocol, count, threads), POOL, "gated", seed)
 
 
-def actions(steps: int, count: int = N, scale: float = 0.3) -> torch.Tensor:
+def actions(steps: int, count: int = N, scale: float = 0.3) -> Tensor:
     return scale * torch.randn(steps, count, 14, generator=torch.Generator().manual_seed(1))
 
 
 def manifest_of(start: Start, target: np.ndarray) -> EpisodeManifest:
     """A manifest of the same episodes as a training start's."""
     count = len(start.friction)
-    columns = {field.name: np.zeros(count) for field in fields(EpisodeManifest)}
+    columns: dict[str, Any] = {field.name: np.zeros(count) for field in fields(EpisodeManifest)}
     columns |= start._asdict()
     columns |= {
         "target_pos_w": POOL.pos_w[target].astype(float),
@@ -86,7 +91,7 @@ def test_the_physics_is_the_evaluations():
 
 
 def test_observations_are_the_evaluations():
-    """Without noise, policy and privileged columns are what the evaluation's sensors say of the same state."""
+    """Without noise, every column is what the evaluation's sensors say of the same state."""
     protocol = coarse(noise=Noise())
     env = environment(protocol)
     env.begin_rollout(0, 4)
@@ -115,7 +120,8 @@ def test_observations_are_the_evaluations():
     )
     active = np.ones(N, dtype=bool)
     seen_by_bench = sensors.observe(4, 0.08, truth, active)
-    body, ee = seen_by_bench.proprioception, seen_by_bench.ee_pose
+    body, ee, privileged = seen_by_bench.proprioception, seen_by_bench.ee_pose, seen_by_bench.privileged
+    assert body and ee and privileged
     default = load_robot().default_q
     ee9 = np.concatenate([ee.pos_b, ee.rot6_b], axis=1)
     common = [body.base_ang_vel_b, body.gravity_b, body.joint_pos - default, body.joint_vel]
@@ -127,8 +133,10 @@ def test_observations_are_the_evaluations():
     target = sensors.target(truth).pos_b
     np.testing.assert_allclose(seen.policy[:, 58:61].numpy(), target, atol=2e-5)
     rot_b = np.swapaxes(truth.base_rot_w, 1, 2) @ episode.target_rot_w.double().numpy()
-    np.testing.assert_allclose(seen.policy[:, 61:67].numpy(), np.concatenate([rot_b[..., 0], rot_b[..., 1]], 1), atol=2e-5)
-    np.testing.assert_allclose(seen.velocity.numpy(), seen_by_bench.privileged.base_lin_vel_b, atol=2e-5)
+    np.testing.assert_allclose(
+        seen.policy[:, 61:67].numpy(), np.concatenate([rot_b[..., 0], rot_b[..., 1]], 1), atol=2e-5
+    )
+    np.testing.assert_allclose(seen.velocity.numpy(), privileged.base_lin_vel_b, atol=2e-5)
 
 
 def test_velocities_are_differences_over_a_period():
@@ -177,8 +185,12 @@ def test_pushes_are_the_manifests():
     """One episode's draw equals the evaluation's from an equal generator."""
     for seed in range(20):
         step, velocity = draw_pushes(PROTOCOL, 1, stream(seed, "test"))
-        time, expected = randomization.draw_pushes(PROTOCOL.push, PROTOCOL.episodes.horizon, stream(seed, "test"))
-        np.testing.assert_array_equal(step[0], np.where(np.isnan(time), -1, np.round(np.nan_to_num(time) / 0.02)))
+        time, expected = randomization.draw_pushes(
+            PROTOCOL.push, PROTOCOL.episodes.horizon, stream(seed, "test")
+        )
+        np.testing.assert_array_equal(
+            step[0], np.where(np.isnan(time), -1, np.round(np.nan_to_num(time) / 0.02))
+        )
         np.testing.assert_array_equal(velocity[0].ravel(), expected)
 
 
@@ -249,7 +261,7 @@ def test_reset_touches_only_what_has_ended():
 
 
 def test_endings():
-    """A tilt beyond the limit and a low base end an episode unsafely; a diverged one is counted, its sum bounded."""
+    """Tilt and a low base end an episode unsafely; a diverged one is counted, its sum bounded."""
     env = environment()
     env.begin_rollout(0, 2)
     env._episode.step.fill_(0)
@@ -323,18 +335,22 @@ def test_the_pool_is_feasible_and_its_own():
     np.testing.assert_array_equal(drawn.pos_w, POOL.pos_w[:2])
     from wbc_bench.manifest import manifest_path, read_manifest
 
-    frozen, _ = read_manifest(*(lambda found: (found[0], manifest_path(found[1])))(find_protocol("ablation_v1")))
+    frozen, _ = read_manifest(
+        *(lambda found: (found[0], manifest_path(found[1])))(find_protocol("ablation_v1"))
+    )
     theirs = {hashlib.sha256(row.tobytes()).digest() for row in frozen.target_pos_w.astype(np.float32)}
     assert not any(hashlib.sha256(row.tobytes()).digest() in theirs for row in POOL.pos_w)
 
 
 def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
-    pool = TargetPool(*(field[:5] for field in POOL))
+    pool = TargetPool(POOL.stratum[:5], POOL.pos_w[:5], POOL.quat_w[:5])
     path = tmp_path / "pool.parquet"
     write_pool(pool, PROTOCOL, path)
     for mine, theirs in zip(read_pool(PROTOCOL, path), pool, strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    narrow = msgspec.structs.replace(PROTOCOL, targets=msgspec.structs.replace(PROTOCOL.targets, x=(0.0, 0.1)))
+    narrow = msgspec.structs.replace(
+        PROTOCOL, targets=msgspec.structs.replace(PROTOCOL.targets, x=(0.0, 0.1))
+    )
     assert digest(narrow) != digest(PROTOCOL) == digest(coarse())
     with pytest.raises(ManifestError, match="draw it again"):
         read_pool(narrow, path)

@@ -6,7 +6,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from torch import Tensor  # noqa: E402
+
 from wbc_baselines.learned import rewards as r  # noqa: E402
+from wbc_baselines.learned.methods import Reward  # noqa: E402
 from wbc_baselines.learned.pool import read_pool  # noqa: E402
 from wbc_baselines.learned.reference import gate  # noqa: E402
 from wbc_baselines.learned.starts import DECAY  # noqa: E402
@@ -47,13 +50,13 @@ def signals(**changes) -> r.Signals:
     return r.Signals(**(rest | changes))
 
 
-def term(name: str, kind: str = "gated", **changes) -> float:
+def term(name: str, kind: Reward = "gated", **changes) -> float:
     """A term per second, before its scale."""
     _, terms, _ = r.rewards(signals(**changes), BODY, kind, PERIOD)
     return float(terms[name]) / (r.SCALES[name] * PERIOD)
 
 
-def column(index: int, value: float, width: int = 3) -> torch.Tensor:
+def column(index: int, value: float, width: int = 3) -> Tensor:
     x = torch.zeros(1, width)
     x[0, index] = value
     return x
@@ -95,7 +98,9 @@ def test_orientation():
 
 def test_reference():
     """d_ref = 3, d = 2 x 0.4 + 0.2 = 1: e_ref = 2 - 0.5 = 1.5, so exp(-3); inside the dead zone 1."""
-    late = term("reference", d_ref=torch.tensor([3.0]), pos_error=torch.tensor([0.4]), rot_error=torch.tensor([0.2]))
+    late = term(
+        "reference", d_ref=torch.tensor([3.0]), pos_error=torch.tensor([0.4]), rot_error=torch.tensor([0.2])
+    )
     g3 = 1 / (1 + math.exp(-10))
     assert late == pytest.approx(g3 * 1.4 * math.exp(-3), rel=1e-5)
     near = term("reference", d_ref=torch.tensor([1.4]), pos_error=torch.tensor([0.5]))
@@ -151,11 +156,32 @@ def test_safety_mixes_by_phase():
     ("name", "value", "changes"),
     [
         ("torque", 25.0, {"joint_torque": column(0, 3.0, 14) + column(5, 4.0, 14)}),
-        ("power", 11.0, {"joint_torque": column(0, 3.0, 14) + column(5, -4.0, 14), "joint_vel": torch.ones(1, 14) * column(0, 1.0, 14) + column(5, 2.0, 14)}),
+        (
+            "power",
+            11.0,
+            {
+                "joint_torque": column(0, 3.0, 14) + column(5, -4.0, 14),
+                "joint_vel": torch.ones(1, 14) * column(0, 1.0, 14) + column(5, 2.0, 14),
+            },
+        ),
         ("action_variation", 5.0, {"action": column(0, 1.0, 14), "previous_action": column(1, 2.0, 14)}),
         # the left sole slides at (3, 4) m/s; the right one is in the air
-        ("foot_slip", 25.0, {"foot_contact": torch.tensor([[1.0, 0.0]]), "foot_vel_w": torch.tensor([[[3.0, 4.0], [9.0, 9.0]]])}),
-        ("non_flat", 0.05, {"foot_contact": torch.tensor([[1.0, 0.0]]), "foot_up_w": torch.tensor([[[0.1, 0.2], [0.9, 0.0]]])}),
+        (
+            "foot_slip",
+            25.0,
+            {
+                "foot_contact": torch.tensor([[1.0, 0.0]]),
+                "foot_vel_w": torch.tensor([[[3.0, 4.0], [9.0, 9.0]]]),
+            },
+        ),
+        (
+            "non_flat",
+            0.05,
+            {
+                "foot_contact": torch.tensor([[1.0, 0.0]]),
+                "foot_up_w": torch.tensor([[[0.1, 0.2], [0.9, 0.0]]]),
+            },
+        ),
         ("leg_separation", 0.04, {"feet_h": torch.tensor([[[0.0, 0.05], [0.0, -0.05]]])}),
         ("joint_limits", 0.7, {"joint_pos": column(0, 2.5, 14) + column(9, -1.2, 14)}),
         ("termination", 1.0, {"terminated": torch.ones(1, dtype=torch.bool)}),
@@ -175,7 +201,11 @@ def test_scales_are_the_papers():
 
 def test_additive_gates_are_constant():
     """Neither phase nor motion changes an additive weight; the safety scores still count."""
-    for name, changes in (("position", {}), ("orientation_fine", {}), ("reference", {"pos_error": torch.zeros(1)})):
+    for name, changes in (
+        ("position", {}),
+        ("orientation_fine", {}),
+        ("reference", {"pos_error": torch.zeros(1)}),
+    ):
         calm = term(name, "additive", **changes)
         wild = term(name, "additive", base_lin_vel=column(0, 2.0), **changes)
         assert calm == wild
@@ -188,8 +218,12 @@ def test_additive_gates_are_constant():
 def test_mean_gate():
     """Of d_ref falling from 2 at 1/s over 2 s: the integral of the logistic function is a softplus."""
     exact = (math.log1p(math.exp(5.0)) - math.log1p(math.exp(-5.0))) / 5 / 2
-    assert float(r.mean_gate(torch.tensor(2.0), torch.tensor(1.0), 2.0, 4000)) == pytest.approx(exact, abs=1e-3)
-    assert float(r.mean_gate(torch.tensor(0.0), torch.tensor(1.0), 10.0)) == pytest.approx(float(gate(torch.zeros(()))))
+    assert float(r.mean_gate(torch.tensor(2.0), torch.tensor(1.0), 2.0, 4000)) == pytest.approx(
+        exact, abs=1e-3
+    )
+    assert float(r.mean_gate(torch.tensor(0.0), torch.tensor(1.0), 10.0)) == pytest.approx(
+        float(gate(torch.zeros(())))
+    )
 
 
 def test_the_additive_phase_is_the_schedules_mean():

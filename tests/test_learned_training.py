@@ -17,6 +17,7 @@ from wbc_baselines.learned import runs  # noqa: E402
 from wbc_baselines.learned.campaign import campaign, is_done, runs_of, standing  # noqa: E402
 from wbc_baselines.learned.cli import main  # noqa: E402
 from wbc_baselines.learned.curves import smooth, write_curves  # noqa: E402
+from wbc_baselines.learned.estimators.latent import LatentEstimator  # noqa: E402
 from wbc_baselines.learned.methods import METHODS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder, run  # noqa: E402
 from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
@@ -24,7 +25,14 @@ from wbc_baselines.learned.training import Trainer, make_environment  # noqa: E4
 from wbc_bench.errors import UnknownNameError  # noqa: E402
 
 TINY = Settings(
-    "no_latent", budget=4 * 8 * 6, envs=8, steps=6, minibatches=2, threads=1, estimator_share=0.5, estimator_minibatches=2
+    "no_latent",
+    budget=4 * 8 * 6,
+    envs=8,
+    steps=6,
+    minibatches=2,
+    threads=1,
+    estimator_share=0.5,
+    estimator_minibatches=2,
 )
 
 
@@ -59,10 +67,8 @@ def test_two_and_two_iterations_are_four(method, tmp_path):
     runs.save_resume(broken, folder, 1.0)
     resumed = trainer(method=method)
     assert runs.load_resume(resumed, folder) == 1.0
-    for _ in range(4):
-        last = unbroken.iterate()
-    for _ in range(2):
-        again = resumed.iterate()
+    last = [unbroken.iterate() for _ in range(4)][-1]
+    again = [resumed.iterate() for _ in range(2)][-1]
     assert_equal(unbroken.save(), resumed.save())
     assert_equal(unbroken.policy_tensors(), resumed.policy_tensors())
     for name, value in last.items():
@@ -81,11 +87,12 @@ def test_equal_seeds_are_equal_and_others_are_not():
 
 
 def test_the_policys_gradient_never_reaches_the_estimator():
-    """After PPO's update the estimator has no gradient and its old weights; its own update leaves the policy's."""
+    """PPO's update leaves the estimator without gradient, weights as they were; and the other way round."""
     t = trainer(method="transformer_gru")
     weights = {name: value.clone() for name, value in t.estimator.state_dict().items()}
     t.environment.begin_rollout(0, TINY.steps)
     rollout = t._roll_out()
+    assert rollout
     assert not t.ppo.storage.observations["context"].requires_grad
     with torch.no_grad():
         t.ppo.compute_returns(t._observations())
@@ -102,24 +109,31 @@ def test_the_policys_gradient_never_reaches_the_estimator():
 
 @pytest.mark.parametrize("method", ["cenet", "gru", "transformer_gru"])
 def test_the_rollout_gives_the_contexts_back(method, monkeypatch):
-    """Unrolled from the stored state, with the stored resets, the windows yield the contexts the actor saw."""
+    """Unrolled from stored state and resets, the windows yield the contexts the actor saw."""
     monkeypatch.setattr(torch, "randn", lambda *size, device=None: torch.zeros(*size))
     t = trainer(method=method)
-    t.environment._episode.step[:3] = t.environment.protocol.num_steps - torch.tensor([2, 4, 11])
+    t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor(
+        [2, 3, 4, 5, 8, 9, 10, 11]
+    )
+    contexts, estimate = [], t._estimate
+
+    def estimated():
+        contexts.append(t._context)  # the one that the step before has used
+        return estimate()
+
+    monkeypatch.setattr(t, "_estimate", estimated)
     for _ in range(2):  # the second rollout begins in the middle of episodes
-        contexts, estimate = [], t._estimate
-        t._estimate = lambda: contexts.append(estimate()) or contexts[-1]  # type: ignore[method-assign]
-        contexts.append(t._context)
+        contexts.clear()
         t.environment.begin_rollout(t.iteration, TINY.steps)
         rollout = t._roll_out()
+        assert rollout and isinstance(t.estimator, LatentEstimator)
         t.iteration += 1
-        t._estimate = estimate  # type: ignore[method-assign]
-        seen = torch.stack(contexts[: TINY.steps])[:, rollout.ids]
         t.ppo.storage.clear()
+        seen = torch.stack(contexts)[:, rollout.ids]
         (batch,) = rollout.batches(1)
         e = t.estimator.encode(batch)
         torch.testing.assert_close(e[..., : seen.shape[-1]], seen, atol=1e-5, rtol=1e-5)
-    assert batch.start.any() and not batch.valid.all()
+        assert batch.start.any() and not batch.valid.all()
 
 
 def test_the_next_observation_is_of_the_next_step():
@@ -128,6 +142,7 @@ def test_the_next_observation_is_of_the_next_step():
     t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor([2, 4, *[100] * 6])
     t.environment.begin_rollout(0, TINY.steps)
     rollout = t._roll_out()
+    assert rollout
     (batch,) = rollout.batches(1)
     # columns shared by the noisy term and the clean observation, up to the noise
     newest = batch.history[1:, :, -1, 6:20]
@@ -152,6 +167,7 @@ def test_time_outs_are_bootstrapped():
     env.begin_rollout(0, 1)
     observations = t._observations()
     step = env.step(t.ppo.act(observations))
+    assert t.ppo.transition.values is not None
     values = t.ppo.transition.values[:, 0].clone()
     t.ppo.process_env_step(t._observations(), step.reward, step.done, {"time_outs": step.time_out})
     stored = t.ppo.storage.rewards[0, :, 0]
@@ -196,7 +212,7 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     resumed = trainer()
     runs.load_resume(resumed, folder)
     assert_equal(unbroken.policy_tensors(), resumed.policy_tensors())
-    with pytest.raises(TrainingError, match="gamma 0.99 -> 0.9"):
+    with pytest.raises(TrainingError, match=r"gamma 0\.99 -> 0\.9"):
         run(replace(constant, gamma=0.9), folder)
 
 
@@ -208,7 +224,9 @@ def test_a_killed_run_resumes(tmp_path):
         "runs.run(Settings('no_latent', budget=1e9, envs=8, steps=6, minibatches=2, threads=1,"
         "estimator_share=0.5, estimator_minibatches=2), runs.RunFolder(Path(sys.argv[1])), tensorboard=False)"
     )
-    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"OMP_NUM_THREADS": "1"})
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
     folder = RunFolder(tmp_path)
     deadline = time.monotonic() + 60
     while len(folder.read_metrics()) < 3 and time.monotonic() < deadline:
@@ -267,7 +285,9 @@ def test_campaign_trains_what_is_missing(tmp_path):
 
 def test_smoothing_weighs_by_episodes():
     """A moving mean over 3 % of the samples: neighbours far apart stay apart, equal samples pool."""
-    rows = [{"samples": s, "x": x, "episode/count": n} for s, x, n in ((1, 0.0, 1), (100, 1.0, 3), (101, 0.0, 1))]
+    rows = [
+        {"samples": s, "x": x, "episode/count": n} for s, x, n in ((1, 0.0, 1), (100, 1.0, 3), (101, 0.0, 1))
+    ]
     samples, values = smooth(rows, "x")
     np.testing.assert_allclose(samples, [1, 100, 101])
     np.testing.assert_allclose(values, [0, 0.75, 0.75])
@@ -290,7 +310,7 @@ def test_mistakes_name_the_valid_values():
 
 
 def test_the_command_line(tmp_path, capsys):
-    """`wbc-train run` with a budget in scientific notation, then `status`; a mistake is one line and code 2."""
+    """`wbc-train run` with a budget like 6e7, then `status`; a mistake is one line and code 2."""
     options = ["--budget", "4.8e1", "--envs", "8", "--steps", "6", "--minibatches", "2", "--threads", "1"]
     options += ["--estimator-share", "0.5", "--out", str(tmp_path)]
     main(["run", "--method", "no_latent", *options])

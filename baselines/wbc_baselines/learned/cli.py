@@ -73,7 +73,14 @@ class Status:
             return "" if value is None else f"{100 * value:.1f}"
 
         cells = [
-            (s.name, s.state, f"{s.samples / 1e6:.1f}", f"{s.seconds / 3600:.2f}", share(s.success), share(s.falls))
+            (
+                s.name,
+                s.state,
+                f"{s.samples / 1e6:.1f}",
+                f"{s.seconds / 3600:.2f}",
+                share(s.success),
+                share(s.falls),
+            )
             for s in standing(self.out)
         ]
         columns = ("Run", "State", "Samples (M)", "Hours", "Success (%)", "Falls (%)")
@@ -107,7 +114,7 @@ class Curves:
 
 @dataclass(frozen=True)
 class Targets:
-    """Draw the pool of feasible targets that training picks from (12,000: about five minutes on two cores)."""
+    """Draw the pool of feasible targets that training picks from (12,000: five minutes on two cores)."""
 
     protocol: str = "ablation_v1"
     """Whose targets."""

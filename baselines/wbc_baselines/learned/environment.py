@@ -90,7 +90,8 @@ class Environment:
     ) -> None:
         self.protocol, self.num_envs, self.device = protocol, backend.num_envs, backend.device
         self.curriculum = 1.0  # part of the ramp over strata that is done
-        self._backend, self._reward, self._seed = backend, reward, seed
+        self._backend, self._seed = backend, seed
+        self._reward: Reward = reward
         self._robot = load_robot(protocol.robot)
         self._pool, self._body = pool, body_of(self._robot, self.device)
         self._default_q = self._tensor(self._robot.default_q)
@@ -302,9 +303,7 @@ class Environment:
     def _see(self) -> Seen:
         state, view, episode = self._state, self._view, self._episode
         ang_vel, joint_vel = state.qvel[:, 3:6], state.qvel[:, 6:]
-        true = inputs.history_term(
-            ang_vel, view.gravity_b, view.joint_pos, joint_vel, state.torque, view.ee
-        )
+        true = inputs.history_term(ang_vel, view.gravity_b, view.joint_pos, joint_vel, state.torque, view.ee)
         term = true + self._noise[self._at]
         privileged = inputs.privileged(
             view.lin_vel_b,
@@ -341,7 +340,7 @@ class Environment:
     def _log(
         self,
         terms: dict[str, Tensor],
-        gates: dict[str, Tensor],
+        gates: dict[str, Tensor | float],
         view: View,
         done: Tensor,
         time_out: Tensor,
@@ -350,7 +349,7 @@ class Environment:
         self._steps += 1
         named = {f"reward/{k}": v for k, v in terms.items()} | {f"gate/{k}": v for k, v in gates.items()}
         for name, value in named.items():
-            self._sums[name] = self._sums.get(name, 0.0) + value.mean()
+            self._sums[name] = self._sums.get(name, 0.0) + torch.as_tensor(value).mean()
         ids = done.nonzero()[:, 0]
         if len(ids) == 0:
             return

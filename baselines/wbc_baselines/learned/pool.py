@@ -1,12 +1,12 @@
 """The targets that training draws from: feasible ones of the evaluation's own generator, made once and kept.
 
 A target takes some 40 ms to find (a `step` target 100 ms), a training run needs one every few hundred
-microseconds. So a pool is drawn once, from streams of which no evaluation shares a key, and episodes pick from
-it.
+microseconds. So a pool is drawn once, from streams of which no evaluation shares a key, and episodes pick
+from it.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -65,11 +65,12 @@ def draw_pool(
         draws = [draw_workspace_target(shifted, 0, k) for k in range(start, min(start + CHUNK, count))]
         return [(STRATA.index(draw.stratum), draw.pos_w, draw.quat_w) for draw in draws]
 
-    rows = []
-    for part in Parallel(n_jobs=workers, return_as="generator")(
+    rows: list[tuple[int, NDArray, NDArray]] = []
+    parts: Iterable = Parallel(n_jobs=workers, return_as="generator")(
         delayed(work)(start) for start in range(0, count, CHUNK)
-    ):
-        rows += part
+    )
+    for part in parts:
+        rows.extend(part)
         progress(len(rows), count)
     stratum, pos, quat = zip(*rows, strict=True)
     return TargetPool(np.array(stratum, np.int8), np.array(pos, np.float32), np.array(quat, np.float32))
@@ -84,7 +85,7 @@ def write_pool(pool: TargetPool, protocol: EvalProtocol, path: Path) -> None:
     table = table.replace_schema_metadata({"protocol": protocol.name, "digest": digest(protocol)})
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_name(f".{path.name}.part")
-    pq.write_table(table, fresh, compression="zstd", use_dictionary=["stratum"])
+    pq.write_table(table, fresh, compression="zstd", use_dictionary=False)
     fresh.replace(path)
 
 
@@ -97,7 +98,8 @@ def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
     path = path or POOLS / f"{protocol.name}.parquet"
     if not path.exists():
         raise ManifestError(
-            f"target pool '{path}' does not exist: make it with `wbc-train targets --protocol {protocol.name}`"
+            f"target pool '{path}' does not exist: make it with "
+            f"`wbc-train targets --protocol {protocol.name}`"
         )
     try:
         table = pq.read_table(path)

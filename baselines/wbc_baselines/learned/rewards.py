@@ -99,8 +99,8 @@ class Gates(NamedTuple):
 
 
 # The additive reward's constants: the mean over an episode of each gate of the gated reward, so that each
-# term keeps its mean weight. PHASE from the reference's schedule alone, over the targets of ablation_v1 and decays
-# U(0.5, 1.4) (`mean_gate`; a test works it out again); the scores, the means of s~ over the part of an
+# term keeps its mean weight. PHASE from the reference's schedule alone, over the targets of ablation_v1 and
+# decays U(0.5, 1.4) (`mean_gate`; a test works it out again); the scores, the means of s~ over the part of an
 # episode where their gate is open, E[(1 - g) s~_m] / E[1 - g] and E[g s~_l] / E[g], were measured on a policy
 # trained with the gated reward (the log's gate/... columns).
 PHASE = 0.1915
@@ -152,11 +152,12 @@ def gates_of(phase: Tensor, s_m: Tensor, s_l: Tensor) -> Gates:
 
 def rewards(
     signals: Signals, body: Body, kind: Reward, period: float
-) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
+) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor | float]]:
     """The reward of one control step of `period` [s].
 
     Returns:
-        total (N,), bounded; the terms by name as they are summed, each (N,); the gates, for the log.
+        total (N,), bounded; the terms by name as they are summed, each (N,); the gates that the
+        gated reward has, for the log.
     """
     s = signals
     s_m, s_l = safety_scores(s, body)
@@ -186,8 +187,7 @@ def rewards(
     }
     terms = {name: value * (SCALES[name] * period) for name, value in raw.items()}
     total = torch.stack(list(terms.values())).sum(0).clamp(-BOUND, BOUND)
-    logged = {"phase": measured.phase, "manipulation": measured.manipulation, "reference": measured.reference}
-    return total, terms, logged | {"progress": measured.progress}
+    return total, terms, measured._asdict()
 
 
 def progress(signals: Signals) -> Tensor:

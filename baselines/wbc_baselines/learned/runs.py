@@ -183,7 +183,7 @@ def run(
     """Train from wherever the folder stands to the budget, and write the final checkpoint.
 
     Raises:
-        TrainingError: see `RunFolder.open`, `load_resume` and `Trainer.iterate`; or another process has the run.
+        TrainingError: see `RunFolder.open`, `load_resume`, `Trainer.iterate`; or another process has the run.
     """
     from wbc_baselines.learned.training import Trainer, make_environment
 
@@ -224,7 +224,7 @@ def run(
 
 @contextmanager
 def _stop_requests() -> Iterator[list[int]]:
-    """A list that fills when the process is asked to stop, so that it can save first; a second ask is obeyed."""
+    """A list that fills when the process is asked to stop, so that it can save; a second ask is obeyed."""
     asked: list[int] = []
 
     def note(number: int, _: object) -> None:

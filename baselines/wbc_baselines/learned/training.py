@@ -8,6 +8,7 @@ seed and the iteration's number, so between two iterations no generator has a st
 import time
 import zlib
 from collections.abc import Iterator
+from itertools import pairwise
 
 import msgspec
 import torch
@@ -119,7 +120,9 @@ class Trainer:
         self._context = self._estimate() if self._estimates else None
         self.ppo = self._make_ppo()
         parameters = list(self.estimator.parameters())
-        self.optimizer = torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
+        self.optimizer = (
+            torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
+        )
 
     def _make_ppo(self) -> PPO:
         settings, seen = self.settings, self._observations()
@@ -204,7 +207,7 @@ class Trainer:
                 f"run {settings.name}: {', '.join(wrong)} is not finite in iteration {self.iteration}; "
                 "the last checkpoint is sound: resume with a smaller --learning-rate or another --seed"
             )
-        seconds = [b - a for a, b in zip(clock[:-1], clock[1:], strict=True)]
+        seconds = [b - a for a, b in pairwise(clock)]
         found |= dict(zip(("time/rollout", "time/policy", "time/estimator"), seconds, strict=True))
         std = ppo.actor.distribution.log_std_param.detach().exp()  # type: ignore[union-attr]
         found |= {
