@@ -6,9 +6,9 @@ from it.
 """
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -66,7 +66,7 @@ def draw_pool(
         return [(STRATA.index(draw.stratum), draw.pos_w, draw.quat_w) for draw in draws]
 
     rows: list[tuple[int, NDArray, NDArray]] = []
-    parts: Iterable = Parallel(n_jobs=workers, return_as="generator")(
+    parts: Any = Parallel(n_jobs=workers, return_as="generator")(
         delayed(work)(start) for start in range(0, count, CHUNK)
     )
     for part in parts:
