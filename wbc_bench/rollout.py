@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.controller import Controller
+from wbc_bench.controller import Controller, ProtocolAware
 from wbc_bench.episodes import EpisodeBatch, Outcome
 from wbc_bench.errors import ControllerError
 from wbc_bench.manifest import EpisodeManifest
@@ -28,6 +28,8 @@ def evaluate(controller: Controller, protocol: EvalProtocol, rows: EpisodeManife
             f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "
             f"protocol {protocol.name} asks for {period:g} s"
         )
+    if isinstance(controller, ProtocolAware):
+        controller.prepare(protocol)
     simulation = Simulation(protocol, rows)
     sensors = Sensors(protocol, rows, controller.info.signals)
     target_rot_w = matrix_from_wxyz(rows.target_quat_w)

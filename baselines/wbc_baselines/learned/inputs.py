@@ -199,3 +199,16 @@ class History:
         import torch
 
         self.window = torch.cat([self.window[:, 1:], term[:, None]], dim=1)
+
+
+def rows() -> list[tuple[str, ...]]:
+    """(vector, columns, size, term, unit) of every input, for `wbc-bench list --inputs`."""
+    found = []
+    for vector, layout in LAYOUTS.items():
+        start = 0
+        for term in layout:
+            columns = f"{start}..{start + term.size - 1}" if term.size > 1 else str(start)
+            found.append((vector, columns, str(term.size), term.name, term.unit))
+            start += term.size
+        found.append((vector, "all", str(start), "", ""))
+    return found

@@ -29,10 +29,10 @@ class Layer(nn.Module):
         super().__init__()
         self.qkv = nn.Linear(MODEL, 3 * MODEL)
         self.out = nn.Linear(MODEL, MODEL)
-        self.norm1, self.norm2 = nn.LayerNorm(MODEL), nn.LayerNorm(MODEL)
-        self.feed = nn.Sequential(
-            nn.Linear(MODEL, FEED_FORWARD), nn.ReLU(inplace=True), nn.Linear(FEED_FORWARD, MODEL)
-        )
+        self.norm1 = nn.LayerNorm(MODEL)
+        self.norm2 = nn.LayerNorm(MODEL)
+        self.widen = nn.Linear(MODEL, FEED_FORWARD)
+        self.narrow = nn.Linear(FEED_FORWARD, MODEL)
 
     def forward(self, x: Tensor, last_only: bool = False) -> Tensor:
         """Tokens (N, T, MODEL) -> tokens of the same shape, or the last one (N, 1, MODEL)."""
