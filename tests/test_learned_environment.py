@@ -23,7 +23,7 @@ from wbc_bench.episodes import STRATA  # noqa: E402
 from wbc_bench.errors import ManifestError  # noqa: E402
 from wbc_bench.manifest import EpisodeManifest  # noqa: E402
 from wbc_bench.observation import Sensors  # noqa: E402
-from wbc_bench.protocol import EvalProtocol, Noise, find_protocol  # noqa: E402
+from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 from wbc_bench.rotations import matrix_from_wxyz  # noqa: E402
@@ -59,6 +59,8 @@ def manifest_of(start: Start, target: np.ndarray) -> EpisodeManifest:
     columns |= {
         "target_pos_w": POOL.pos_w[target].astype(float),
         "target_quat_w": POOL.quat_w[target].astype(float),
+        "push_time": np.full((count, MAX_PUSHES), np.nan),
+        "push_vel": np.zeros((count, 2 * MAX_PUSHES)),
         "noise_key": np.arange(count),
     }
     return EpisodeManifest(**columns)

@@ -7,22 +7,35 @@ import sys
 import time
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
-from wbc_baselines.learned import runs  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
+from test_learned_environment import POOL, manifest_of  # noqa: E402
+
+from wbc_baselines.learned import checkpoint, runs  # noqa: E402
+from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.campaign import campaign, is_done, runs_of, standing  # noqa: E402
 from wbc_baselines.learned.cli import main  # noqa: E402
 from wbc_baselines.learned.curves import smooth, write_curves  # noqa: E402
+from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment  # noqa: E402
 from wbc_baselines.learned.estimators.latent import LatentEstimator  # noqa: E402
+from wbc_baselines.learned.inputs import History  # noqa: E402
 from wbc_baselines.learned.methods import METHODS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder, run  # noqa: E402
 from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
+from wbc_baselines.learned.starts import draw_starts  # noqa: E402
 from wbc_baselines.learned.training import Trainer, make_environment  # noqa: E402
+from wbc_bench.controller import load_controller  # noqa: E402
 from wbc_bench.errors import UnknownNameError  # noqa: E402
+from wbc_bench.protocol import Noise, Push, find_protocol  # noqa: E402
+from wbc_bench.randomness import stream  # noqa: E402
+from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_bench.rollout import evaluate  # noqa: E402
 
 TINY = Settings(
     "no_latent",
@@ -63,14 +76,14 @@ def test_two_and_two_iterations_are_four(method, tmp_path):
     unbroken, broken = trainer(method=method), trainer(method=method)
     for _ in range(2):
         broken.iterate()
-    folder = RunFolder(tmp_path)
+    folder = RunFolder(tmp_path / broken.settings.name)
+    folder.open(broken.settings)
     runs.save_resume(broken, folder, 1.0)
     resumed = trainer(method=method)
     assert runs.load_resume(resumed, folder) == 1.0
     last = [unbroken.iterate() for _ in range(4)][-1]
     again = [resumed.iterate() for _ in range(2)][-1]
     assert_equal(unbroken.save(), resumed.save())
-    assert_equal(unbroken.policy_tensors(), resumed.policy_tensors())
     for name, value in last.items():
         if not name.startswith("time/"):
             np.testing.assert_equal(again[name], value, err_msg=name)
@@ -80,10 +93,8 @@ def test_equal_seeds_are_equal_and_others_are_not():
     one, same, other = trainer(seed=1), trainer(seed=1), trainer(seed=2)
     for each in (one, same, other):
         each.iterate()
-    assert_equal(one.policy_tensors(), same.policy_tensors())
-    assert not torch.equal(
-        one.policy_tensors()["actor.mlp.0.weight"], other.policy_tensors()["actor.mlp.0.weight"]
-    )
+    assert_equal(dict(one.actor().state_dict()), dict(same.actor().state_dict()))
+    assert not torch.equal(one.actor().mlp[0].weight, other.actor().mlp[0].weight)
 
 
 def test_the_policys_gradient_never_reaches_the_estimator():
@@ -186,6 +197,49 @@ def test_entropy_and_curriculum_follow_the_budget():
     np.testing.assert_allclose(ramp, [0, 0.5, 1, 1])
 
 
+@pytest.mark.parametrize("method", ["no_latent", "cenet", "transformer_gru", "oracle"])
+def test_the_evaluation_takes_the_same_actions(method, tmp_path):
+    """Without noise, the checkpoint in the bench commands what the trained networks command in training."""
+    t = trainer(method=method)
+    for _ in range(2):
+        t.iterate()
+    path = tmp_path / "trained.safetensors"
+    t.write_checkpoint(path, 1.0)
+
+    protocol, _ = find_protocol("ablation_v1")
+    episodes = msgspec.structs.replace(protocol.episodes, horizon=1.0)
+    protocol = msgspec.structs.replace(protocol, noise=Noise(), push=Push(), episodes=episodes)
+    env = Environment(protocol, CpuBackend(protocol, 4, 1), POOL, "gated", 7)
+    target = draw_starts(protocol, POOL, 4, stream(7, "training start", 0)).target  # what it has drawn
+    start = draw_starts(protocol, POOL, 4, stream(7, "training start", 0)).start
+    episode = env._episode
+    episode.d_ref[:] = 2 * env._view.pos_error + env._view.rot_error
+    episode.step[:], episode.decay[:] = 0, protocol.reference_decay
+
+    env.seen = env._see()  # of a new episode
+    history, state = History(env.seen.term), torch.zeros(4, t.estimator.state_dim)
+    env.begin_rollout(0, 25)
+    expected = []
+    with torch.no_grad():
+        for _ in range(25):
+            context = env.seen.critic[:, PRIVILEGED_COLUMNS]
+            if method != "oracle":
+                context, state = t.estimator.step(history.window, state)
+            groups = {"policy": env.seen.policy, "context": context}
+            action = t.ppo.actor(TensorDict(groups, batch_size=[4]))
+            expected.append(action)
+            env.step(action)
+            history.push(env.seen.term)
+
+    controller = load_controller(f"learned:{path}", load_robot(protocol.robot))
+    found = evaluate(controller, protocol, manifest_of(start, target))
+    lasted = min(25, int(found.steps.min()))
+    assert lasted > 10
+    np.testing.assert_allclose(
+        found.action[:, :lasted], torch.stack(expected, 1)[:, :lasted].numpy(), atol=2e-4, rtol=0
+    )
+
+
 # ---- files -----------------------------------------------------------------------------------------------
 
 
@@ -211,7 +265,8 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
         unbroken.iterate()
     resumed = trainer()
     runs.load_resume(resumed, folder)
-    assert_equal(unbroken.policy_tensors(), resumed.policy_tensors())
+    assert_equal(unbroken.save(), resumed.save())
+    assert checkpoint.load(folder.checkpoint).card.samples == 192
     with pytest.raises(TrainingError, match=r"gamma 0\.99 -> 0\.9"):
         run(replace(constant, gamma=0.9), folder)
 
@@ -257,7 +312,8 @@ def test_claims(tmp_path):
 
 
 def test_a_damaged_resume_file_is_one_line(tmp_path):
-    t, folder = trainer(), RunFolder(tmp_path)
+    t, folder = trainer(), RunFolder(tmp_path / TINY.name)
+    folder.open(TINY)
     runs.save_resume(t, folder, 0.0)
     folder.resume.write_bytes(folder.resume.read_bytes()[:1000])
     with pytest.raises(TrainingError, match="cannot be read"):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wbc_baselines.learned.settings import Settings, TrainingError
+from wbc_bench.store import write_atomic
 
 if TYPE_CHECKING:
     from wbc_baselines.learned.training import Trainer
@@ -39,6 +40,11 @@ class RunFolder:
     @property
     def resume(self) -> Path:
         return self.path / "resume.pt"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What an evaluation reads, `learned:PATH`; as old as the resume file."""
+        return self.path / f"{self.path.name}.safetensors"
 
     @property
     def claim(self) -> Path:
@@ -132,22 +138,13 @@ class RunFolder:
         self.claim.unlink(missing_ok=True)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all."""
-    fresh = path.with_name(f".{path.name}.part")
-    with fresh.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    fresh.replace(path)
-
-
 def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
-    """Write the resume file; `seconds` of training so far."""
+    """Write checkpoint and resume file; `seconds` of training so far."""
     import io
 
     import torch
 
+    trainer.write_checkpoint(folder.checkpoint, seconds)
     buffer = io.BytesIO()
     torch.save(trainer.save() | {"seconds": seconds}, buffer)
     write_atomic(folder.resume, buffer.getvalue())
@@ -215,7 +212,8 @@ def run(
                     folder.touch()
                 if stop:
                     raise KeyboardInterrupt
-        finish(trainer, folder, time.monotonic() - started)
+        note = {"samples": trainer.samples, "seconds": time.monotonic() - started}
+        write_atomic(folder.finished, json.dumps(note).encode())
         if writer:
             writer.close()
     finally:
@@ -247,12 +245,6 @@ def line(trainer: "Trainer", metrics: dict[str, float], rate: float) -> str:
         f"{trainer.settings.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
         f"return {metrics['episode/return']:.1f}, success {share['success']:.1%}, falls {share['falls']:.1%}"
     )
-
-
-def finish(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
-    """Write the checkpoint that an evaluation reads, then the note that the run is done."""
-    note = {"samples": trainer.samples, "seconds": seconds}
-    write_atomic(folder.finished, json.dumps(note).encode())
 
 
 def _writer(folder: RunFolder, iteration: int):

@@ -9,6 +9,7 @@ import time
 import zlib
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 
 import msgspec
 import torch
@@ -18,11 +19,12 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
+from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment, Step
 from wbc_baselines.learned.estimators import Batch, make_estimator
 from wbc_baselines.learned.inputs import ACTIONS, HISTORY, HISTORY_TERM, NEXT_OBSERVATION, History
 from wbc_baselines.learned.methods import METHODS
-from wbc_baselines.learned.networks import HIDDEN
+from wbc_baselines.learned.networks import HIDDEN, Actor
 from wbc_baselines.learned.pool import TargetPool, read_pool
 from wbc_baselines.learned.settings import Settings, TrainingError
 from wbc_bench.protocol import EvalProtocol, find_protocol
@@ -283,14 +285,22 @@ class Trainer:
 
     # ---- networks for an evaluation, and everything for a resume -------------------------------------------
 
-    def policy_tensors(self) -> dict[str, Tensor]:
-        """What an evaluation needs: `actor.mlp.*`, `actor.normalizer.{mean,std}`, `estimator.*`."""
-        actor = self.ppo.actor
-        tensors = {f"actor.mlp.{name}": value for name, value in actor.mlp.state_dict().items()}
-        normalizer = actor.obs_normalizer
-        tensors |= {"actor.normalizer.mean": normalizer.mean, "actor.normalizer.std": normalizer.std}
-        tensors |= {f"estimator.{name}": value for name, value in self.estimator.state_dict().items()}
-        return {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    def actor(self) -> Actor:
+        """The policy's mean, in the form of an evaluation."""
+        trained, actor = self.ppo.actor, Actor(self.estimator.context_dim)
+        weights = {f"mlp.{name}": value for name, value in trained.mlp.state_dict().items()}
+        normalizer = trained.obs_normalizer
+        actor.load_state_dict(
+            weights | {"normalizer.mean": normalizer.mean, "normalizer.std": normalizer.std}
+        )
+        return actor.eval()
+
+    def write_checkpoint(self, path: Path, seconds: float) -> None:
+        """Write what an evaluation needs, with its card; `seconds` of training so far."""
+        settings = self.settings
+        protocol, _ = find_protocol(settings.protocol)
+        card = checkpoint.new_card(settings.method, settings.seed, self.samples, seconds, protocol)
+        checkpoint.save(path, self.actor(), self.estimator, card)
 
     def save(self) -> dict:
         """Everything that the next iterations depend on, as tensors and numbers."""
