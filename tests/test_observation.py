@@ -51,6 +51,7 @@ def random_state(seed: int = 0, count: int = COUNT) -> State:
         joint_torque=rng.normal(size=(count, 14)),
         ee_pos_w=rng.normal(size=(count, 3)),
         ee_rot_w=matrix_from_rpy(rng.uniform(-3, 3, (count, 3))),
+        foot_pos_w=rng.normal(size=(count, 2, 3)),
         foot_force_w=rng.normal(size=(count, 2, 3)),
         ground_contact=np.zeros(count, dtype=bool),
         diverged=np.zeros(count, dtype=bool),

@@ -16,7 +16,7 @@ from wbc_bench.errors import BenchError, UnknownNameError
 
 if TYPE_CHECKING:
     from wbc_bench.execution import Engine
-    from wbc_bench.robot import RobotConfig
+    from wbc_bench.robot import Robot, RobotConfig
     from wbc_bench.store import ResultStore
 
 # One thread a worker, whatever a library would like: set before numpy is loaded, inherited by workers.
@@ -24,6 +24,9 @@ THREADS = {
     f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "VECLIB_MAXIMUM")
 }
 BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
+INPUTS = (
+    "wbc_bench.inputs"  # entry points: name -> a callable that returns rows (vector, columns, term, unit)
+)
 
 
 class UsageError(BenchError):
@@ -62,7 +65,6 @@ class _Evaluation:
         optional: bool = False,
     ) -> "ResultStore":
         """Check everything, then run; with `optional`, what cannot be loaded is skipped with a line."""
-        from wbc_bench.controller import load_controller
         from wbc_bench.execution import Job, run_jobs
         from wbc_bench.manifest import manifest_path, read_manifest
         from wbc_bench.protocol import find_protocol
@@ -79,18 +81,17 @@ class _Evaluation:
             "--episodes", episodes, asked.per_replicate, f"episodes a replicate of {protocol.name}"
         )
         manifest, sha256 = read_manifest(protocol, manifest_path(path))
-        robot, found = load_robot(protocol.robot), []
-        for spec in dict.fromkeys(specs):
-            try:
-                load_controller(spec, robot)
-                found.append(spec)
-            except BenchError as error:
-                if not optional:
-                    raise
-                print(f"not evaluated: {spec}: {error}", file=sys.stderr)
+        found = {
+            spec: _loadable(spec, range(seeds), load_robot(protocol.robot), optional)
+            for spec in dict.fromkeys(specs)
+        }
         store = ResultStore(self.out)
         store.probe()
-        jobs = [Job(protocol, manifest, sha256, spec, range(seeds), episodes) for spec in found]
+        jobs = [
+            Job(protocol, manifest, sha256, spec, replicates, episodes)
+            for spec, replicates in found.items()
+            if replicates
+        ]
         run_jobs(jobs, store, engine, self.redo)
         return store
 
@@ -285,13 +286,22 @@ class List:
 
     results: Path = Path("results")
     """Folder of the records."""
+    inputs: FlagCreatePairsOff[bool] = False
+    """Instead, what stands in which column of the inputs of learned controllers."""
 
     def run(self) -> None:
         from importlib.metadata import entry_points
 
+        from wbc_bench.markup import Table
+
+        if self.inputs:
+            for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
+                header = ("Vector", "Columns", "Size", "Term", "Unit")
+                _print_table(Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()())))
+            return
+
         from wbc_bench.controller import controllers
         from wbc_bench.manifest import manifest_path
-        from wbc_bench.markup import Table
         from wbc_bench.metrics import METRICS
         from wbc_bench.protocol import find_protocol, protocol_names
         from wbc_bench.sources.library import find_script, script_names
@@ -340,6 +350,36 @@ class List:
         ]
         header = ("Protocol", "Controller", "Replicate", "Episodes", "Created (UTC)", "Commit")
         _print_table(Table("runs", f"Runs under {self.results}", header, tuple(rows)))
+
+
+@dataclass(frozen=True)
+class ExportController:
+    """Write a controller to a file for other runtimes, normalisers, window and recurrent state included."""
+
+    controller: str = tyro.MISSING
+    """Controller that can be exported: name:variant."""
+    format: str = "onnx"
+    """Format of the file."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File to write; named after the controller when not given."""
+    protocol: str = "ablation_v1"
+    """Protocol whose robot it drives."""
+
+    def run(self) -> None:
+        from wbc_bench.controller import Exportable, load_controller, slug
+        from wbc_bench.protocol import find_protocol
+        from wbc_bench.robot import load_robot
+        from wbc_bench.store import ResultStore
+
+        robot = load_robot(find_protocol(self.protocol)[0].robot)
+        controller = load_controller(self.controller, robot)
+        formats = controller.formats if isinstance(controller, Exportable) else ()
+        if not isinstance(controller, Exportable) or self.format not in formats:
+            raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
+        path = self.out or Path(f"{slug(self.controller)}.{self.format}")
+        ResultStore(path.parent).probe()
+        controller.export(path, self.format)
+        print(path)
 
 
 @dataclass(frozen=True)
@@ -520,6 +560,7 @@ Command = (
         Annotated[Export, subcommand("export")] | Annotated[Picture, subcommand("show")],
         subcommand("robot", description="Export or draw the robot."),
     ]
+    | Annotated[ExportController, subcommand("export")]
     | Annotated[Bench, subcommand("bench")]
 )
 
@@ -535,6 +576,32 @@ def _within(option: str, value: int | None, most: int, what: str) -> int:
     if not 1 <= value <= most:
         raise UsageError(f"{option} {value}: valid: 1 to {most} ({what})")
     return value
+
+
+def _loadable(spec: str, replicates: range, robot: "Robot", optional: bool) -> list[int]:
+    """Replicates whose controller can be loaded; with `optional` the others are skipped with a line."""
+    from wbc_bench.controller import load_controller, spec_of_replicate
+
+    found: list[int] = []
+    problems: dict[str, str] = {}  # spec of a replicate -> why not
+    loaded: set[str] = set()
+    for replicate in replicates:
+        one = spec_of_replicate(spec, replicate)
+        if one in problems:
+            continue
+        try:
+            if one not in loaded:
+                load_controller(one, robot)
+            loaded.add(one)
+            found.append(replicate)
+        except BenchError as error:
+            if not optional:
+                raise
+            problems[one] = str(error)
+    lines = problems.values() if found else list(problems.values())[:1]
+    for line in lines:
+        print(f"not evaluated: {spec}: {line}", file=sys.stderr)
+    return found
 
 
 def _print_table(table) -> None:

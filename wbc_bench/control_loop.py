@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.controller import Controller, Target
+from wbc_bench.controller import Controller, ProtocolAware, Target
 from wbc_bench.episodes import Outcome
 from wbc_bench.errors import ControllerError
 from wbc_bench.manifest import EpisodeManifest
@@ -36,6 +36,8 @@ class ControlLoop:
                 f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "
                 f"protocol {protocol.name} asks for {period:g} s"
             )
+        if isinstance(controller, ProtocolAware):
+            controller.prepare(protocol)
         self._controller, self._protocol, self._rows = controller, protocol, rows
         self.simulation = Simulation(protocol, rows)
         self.sensors = Sensors(protocol, rows, controller.info.signals)

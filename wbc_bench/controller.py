@@ -5,12 +5,13 @@ import re
 import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
+from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import Robot
 
 Array = NDArray[np.float64]
@@ -63,6 +64,12 @@ class Privileged(NamedTuple):
     kd_scale: Array  # (N, 14)
     foot_force_w: Array  # (N, 2, 3) [N] ground on left and right sole
     base_lin_vel_b: Array  # (N, 3) [m/s]
+    joint_torque: Array  # (N, 14) [N m] without noise
+    foot_pos_b: Array  # (N, 2, 3) [m] left and right sole
+    # mean rates over the last control period, zero at the start; the end-effector's is seen from the world
+    joint_acc: Array  # (N, 14) [rad/s^2]
+    ee_lin_vel_b: Array  # (N, 3) [m/s]
+    ee_ang_vel_b: Array  # (N, 3) [rad/s]
 
 
 class Observation(NamedTuple):
@@ -88,6 +95,35 @@ class JointCommand(NamedTuple):
 
     q: Array  # (N, 14) [rad]
     infeasible: NDArray[np.bool_] | None = None  # (N,) steps on which a solver found nothing
+
+
+@runtime_checkable
+class ProtocolAware(Protocol):
+    """A controller that reads the protocol: its reference decays at the protocol's rate, for example."""
+
+    def prepare(self, protocol: EvalProtocol) -> None:
+        """Called once, before the first reset. Raises: BenchError, what of the protocol it cannot meet."""
+        ...
+
+
+@runtime_checkable
+class Exportable(Protocol):
+    """A controller that can be written to a file for other runtimes."""
+
+    formats: tuple[str, ...]
+
+    def export(self, path: Path, format: str) -> None:
+        """Write it in one of its formats."""
+        ...
+
+
+@runtime_checkable
+class PerReplicate(Protocol):
+    """A factory whose variants may stand for several controllers, e.g. one training seed a replicate."""
+
+    def of_replicate(self, variant: str, replicate: int) -> str:
+        """The variant that meets the episodes of one replicate."""
+        ...
 
 
 class Controller(Protocol):
@@ -142,6 +178,21 @@ def load_controller(spec: str, robot: Robot) -> Controller:
         if signal not in SIGNALS:
             raise UnknownNameError("signal", signal, SIGNALS, f"declared by controller '{spec}'")
     return controller
+
+
+def spec_of_replicate(spec: str, replicate: int) -> str:
+    """The spec of the controller that meets one replicate: SPEC itself, unless its factory says otherwise.
+
+    Raises: ControllerError, the factory cannot be imported.
+    """
+    name, _, variant = spec.partition(":")
+    if name not in (installed := controllers()):
+        return spec
+    try:
+        factory = installed[name].load()
+    except ImportError as error:
+        raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
+    return f"{name}:{factory.of_replicate(variant, replicate)}" if isinstance(factory, PerReplicate) else spec
 
 
 def slug(spec: str) -> str:

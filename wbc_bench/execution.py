@@ -22,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from wbc_bench import metrics, provenance
-from wbc_bench.controller import Controller, load_controller
+from wbc_bench.controller import Controller, load_controller, spec_of_replicate
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.progress import Progress
@@ -125,9 +125,11 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool
     with ExitStack() as stack:
         runs = []
         for job in jobs:
-            controller = load_controller(job.spec, load_robot(job.protocol.robot))
-            software = provenance.software_digest(controller)
             for replicate in job.replicates:
+                # one controller may meet all replicates, or another one each
+                spec = spec_of_replicate(job.spec, replicate)
+                controller = load_controller(spec, load_robot(job.protocol.robot))
+                software = provenance.software_digest(controller)
                 runs.append(_Run(job, controller, replicate, software, store, redo))
                 stack.callback(runs[-1].writer.close)
         tasks = (task for number, run in enumerate(runs) for task in run.tasks(number))
@@ -176,7 +178,8 @@ class _Run:
     def tasks(self, number: int) -> Iterator[Task]:
         for shard in self.writer.missing:
             rows = self._rows.take(np.asarray(self.writer.rows(shard)))
-            yield Task(number, shard, self.job.spec, self.job.protocol, rows)
+            spec = spec_of_replicate(self.job.spec, self.replicate)
+            yield Task(number, shard, spec, self.job.protocol, rows)
 
     def report_kept(self) -> None:
         """Say what is not evaluated again, and whether other code made it: nobody may take it for new."""

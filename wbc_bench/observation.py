@@ -58,6 +58,8 @@ class Sensors:
                 axis=1,
             )  # (T + 1, N, columns)
         self._target_rot_w = matrix_from_wxyz(rows.target_quat_w)
+        self._period = protocol.control_period
+        self._before: State | None = None
 
     def observe(self, step: int, time: float, state: State, active: NDArray[np.bool_]) -> Observation:
         """The observation at control step `step`, time [s]."""
@@ -89,8 +91,24 @@ class Sensors:
                 kd_scale=rows.kd_scale,
                 foot_force_w=state.foot_force_w,
                 base_lin_vel_b=np.einsum("nji,nj->ni", rot_w, state.base_lin_vel_w),
+                joint_torque=state.joint_torque,
+                foot_pos_b=(state.foot_pos_w - state.base_pos_w[:, None]) @ rot_w,
+                **self._rates(state),
             )
         return Observation(time, active.copy(), proprioception, ee_pose, base_pose, privileged)
+
+    def _rates(self, state: State) -> dict[str, Array]:
+        """Finite differences to the state of the observation before."""
+        before, self._before = self._before or state, state
+        turned = state.ee_rot_w @ np.swapaxes(before.ee_rot_w, 1, 2)
+        skew = (turned - np.swapaxes(turned, 1, 2)) / 2
+        # the sine of the angle of a period stands for the angle: 0.1 % off at 4 rad/s
+        ang = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=-1)
+        rate = 1 / self._period  # [1/s]
+        world = np.stack([state.ee_pos_w - before.ee_pos_w, ang], axis=1) * rate  # (N, 2, 3)
+        lin_b, ang_b = np.moveaxis(world @ state.base_rot_w, 1, 0)
+        joint_acc = (state.joint_vel - before.joint_vel) * rate
+        return {"joint_acc": joint_acc, "ee_lin_vel_b": lin_b, "ee_ang_vel_b": ang_b}
 
     def target(self, state: State) -> Target:
         """The target of each episode in its instantaneous base frame."""

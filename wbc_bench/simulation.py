@@ -31,6 +31,7 @@ class State(NamedTuple):
     joint_torque: Array  # (N, 14) [N m]
     ee_pos_w: Array  # (N, 3) [m]
     ee_rot_w: Array  # (N, 3, 3)
+    foot_pos_w: Array  # (N, 2, 3) [m] left and right sole
     foot_force_w: Array  # (N, 2, 3) [N] ground on left and right sole, one physics step late
     ground_contact: NDArray[
         np.bool_
@@ -53,6 +54,7 @@ class Simulation:
         self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
         self._torque, self._sensor = batch.bind("actuator_force"), batch.bind("sensordata")
         self._tcp = model.site("tcp").id
+        self._feet = [model.site(f"sole_{side}").id for side in "LR"]
         names = [model.sensor(i).name for i in range(model.nsensor)]
         address = {name: model.sensor_adr[i] for i, name in enumerate(names)}
         self._ground = np.array([address[name] for name in names if name.startswith("ground_")])
@@ -115,6 +117,7 @@ class Simulation:
             joint_torque=self._torque.copy(),
             ee_pos_w=self._site_xpos[:, self._tcp].copy(),
             ee_rot_w=self._site_xmat[:, self._tcp].reshape(-1, 3, 3).copy(),
+            foot_pos_w=self._site_xpos[:, self._feet],
             foot_force_w=self._sensor[:, self._soles],
             ground_contact=np.any(self._sensor[:, self._ground] > 0, axis=1),
             diverged=~(np.isfinite(qpos).all(axis=1) & (speed < MAX_SPEED)) | fatal,

@@ -1,0 +1,1 @@
+"""Where training's physics runs; one interface, one model."""

@@ -1,0 +1,70 @@
+"""What the training environment asks of its physics."""
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10 ms steps counts as diverged
+
+
+class Start(NamedTuple):
+    """How K episodes start: columns as those of an evaluation's manifest, on the host."""
+
+    base_height: NDArray[np.float64]  # (K,) [m]
+    friction: NDArray[np.float64]  # (K,)
+    base_mass: NDArray[np.float64]  # (K,) [kg] added
+    base_vel: NDArray[np.float64]  # (K, 6) linear in the world [m/s], angular in the base [rad/s]
+    leg_q: NDArray[np.float64]  # (K, 8) [rad] added to the default posture
+    leg_qd: NDArray[np.float64]  # (K, 8) [rad/s]
+    kp_scale: NDArray[np.float64]  # (K, 14)
+    kd_scale: NDArray[np.float64]  # (K, 14)
+
+
+class State(NamedTuple):
+    """The true state of N simulations after a control step, float32, fresh tensors."""
+
+    qpos: Tensor  # (N, 21) position [m], wxyz, joints [rad]
+    qvel: Tensor  # (N, 20) linear in the world [m/s], angular in the base [rad/s], joints [rad/s]
+    torque: Tensor  # (N, 14) [N m]
+    ee_pos_w: Tensor  # (N, 3) [m]
+    ee_rot_w: Tensor  # (N, 3, 3)
+    feet_pos_w: Tensor  # (N, 2, 3) [m] left, right sole
+    feet_up_w: Tensor  # (N, 2, 2) horizontal part of the soles' normal
+    foot_force_w: Tensor  # (N, 2, 3) [N] one physics step late
+    ground_contact: Tensor  # (N,) bool, one physics step late
+    diverged: Tensor  # (N,) bool
+
+    def put(self, ids: Tensor, rows: "State") -> None:
+        """Overwrite the simulations `ids` (K,) with the rows of another state."""
+        for mine, theirs in zip(self, rows, strict=True):
+            mine[ids] = theirs
+
+
+class Backend(Protocol):
+    """N simulations of the robot of one protocol."""
+
+    num_envs: int
+    device: torch.device
+
+    def reset(self, ids: NDArray[np.int64], start: Start) -> State:
+        """Start the simulations `ids` (K,) anew; their state, K rows."""
+        ...
+
+    def push(self, ids: Tensor, velocity_w: Tensor) -> None:
+        """Add (K, 2) [m/s] to the base's horizontal velocity of `ids` (K,)."""
+        ...
+
+    def step(self, command: Tensor) -> State:
+        """Track joint commands (N, 14) [rad] for one control period."""
+        ...
+
+    def save(self) -> dict[str, NDArray]:
+        """Everything that a later step depends on."""
+        ...
+
+    def load(self, saved: dict[str, NDArray]) -> None:
+        """Go on from what `save` returned."""
+        ...

@@ -1,0 +1,110 @@
+"""MuJoCo's batch API: the C engine of the evaluation, on a few threads."""
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wbc_baselines.learned.backends.base import MAX_SPEED, Start, State
+from wbc_bench.protocol import EvalProtocol
+from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+
+_STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
+# on these MuJoCo resets the simulation or zeroes its controls, and goes on as if nothing had happened
+_FATAL = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC", "CTRL")]
+_STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
+_MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
+
+
+class CpuBackend:
+    """N simulations on `threads` threads; the result does not depend on how many."""
+
+    def __init__(self, protocol: EvalProtocol, num_envs: int, threads: int) -> None:
+        self.num_envs, self.device = num_envs, torch.device("cpu")
+        self._robot = robot = load_robot(protocol.robot)
+        self._model = model = robot.model(protocol.physics.timestep)
+        self._decimation = protocol.physics.decimation
+        self._batch = batch = Batch(model, num_envs, nthread=threads, persistent=True)
+        self._state = {name: batch.bind(name) for name in _STATE}
+        self._fields = {name: batch.expand(name) for name in _MODEL}
+        outputs = {name: batch.bind(name) for name in ("site_xpos", "site_xmat", "sensordata")}
+        self._out = outputs | {"actuator_force": batch.bind("actuator_force")}
+        self._sites = [model.site(name).id for name in ("tcp", "sole_L", "sole_R")]
+        names = [model.sensor(i).name for i in range(model.nsensor)]
+        address = {name: int(model.sensor_adr[i]) for i, name in enumerate(names)}
+        self._ground = [address[name] for name in names if name.startswith("ground_")]
+        self._soles = [address[f"sole_{side}_force"] + k for side in "LR" for k in range(3)]
+        self._base = model.body(robot.facts.base).id
+
+    def reset(self, ids: NDArray[np.int64], start: Start) -> State:
+        self._randomise(ids, start)
+        self._batch.reset(ids, stage=_STAGE_NONE)
+        default = self._robot.default_q
+        qpos, qvel = np.zeros((len(ids), 21)), np.zeros((len(ids), 20))
+        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = start.base_height, 1.0, default
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += start.leg_q
+        qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = start.base_vel, start.leg_qd
+        self._state["qpos"][ids], self._state["qvel"][ids] = qpos, qvel
+        self._state["ctrl"][ids] = default
+        self._batch.forward(ids)
+        return self._read(ids)
+
+    def _randomise(self, ids: NDArray[np.int64], start: Start) -> None:
+        """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
+        model, fields, base = self._model, self._fields, self._base
+        # the larger coefficient of a pair counts, so both sides carry the draw
+        fields["geom_friction"][ids, :, 0] = start.friction[:, None]
+        mass = model.body_mass[base] + start.base_mass
+        fields["body_mass"][ids, base] = mass
+        fields["body_inertia"][ids, base] = model.body_inertia[base] * (mass / model.body_mass[base])[:, None]
+        fields["actuator_gainprm"][ids, :, 0] = model.actuator_gainprm[:, 0] * start.kp_scale
+        fields["actuator_biasprm"][ids, :, 1] = model.actuator_biasprm[:, 1] * start.kp_scale
+        fields["actuator_biasprm"][ids, :, 2] = model.actuator_biasprm[:, 2] * start.kd_scale
+        self._batch.set_const(ids)
+
+    def push(self, ids: Tensor, velocity_w: Tensor) -> None:
+        self._state["qvel"][ids.numpy(), :2] += velocity_w.numpy()
+
+    def step(self, command: Tensor) -> State:
+        self._state["ctrl"][:] = command.numpy()
+        self._batch.step(nstep=self._decimation, stage=_STAGE_VEL)
+        return self._read(slice(None))
+
+    def _read(self, ids: NDArray[np.int64] | slice) -> State:
+        def take(array: NDArray[np.float64]) -> Tensor:
+            return torch.from_numpy(array[ids].astype(np.float32))
+
+        qpos, qvel = take(self._state["qpos"]), take(self._state["qvel"])
+        pos, rot = take(self._out["site_xpos"]), take(self._out["site_xmat"]).unflatten(-1, (3, 3))
+        sensor = take(self._out["sensordata"])
+        tcp, soles = self._sites[0], self._sites[1:]
+        sound = (qvel.abs() < MAX_SPEED).all(-1) & qpos.isfinite().all(-1)
+        fatal = torch.from_numpy((self._batch.warning[ids][:, _FATAL, 1] > 0).any(1))
+        return State(
+            qpos=qpos,
+            qvel=qvel,
+            torque=take(self._out["actuator_force"]),
+            ee_pos_w=pos[:, tcp].contiguous(),
+            ee_rot_w=rot[:, tcp].contiguous(),
+            feet_pos_w=pos[:, soles],
+            feet_up_w=rot[:, soles, :2, 2].contiguous(),
+            foot_force_w=sensor[:, self._soles].unflatten(-1, (2, 3)),
+            ground_contact=(sensor[:, self._ground] > 0).any(-1),
+            diverged=~sound | fatal,
+        )
+
+    def save(self) -> dict[str, NDArray]:
+        return {name: array.copy() for name, array in (self._state | self._fields).items()}
+
+    def load(self, saved: dict[str, NDArray]) -> None:
+        for name, array in self._fields.items():
+            array[:] = saved[name]
+        self._batch.set_const()
+        self._batch.reset(stage=_STAGE_NONE)
+        for name, array in self._state.items():
+            array[:] = saved[name]
+        self._batch.forward(stage=_STAGE_VEL)
+        # forward leaves the solver's warm start as the reset found it
+        self._state["qacc_warmstart"][:] = saved["qacc_warmstart"]

@@ -1,0 +1,166 @@
+"""The command line of training: `wbc-train COMMAND --help`."""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import OmitArgPrefixes, subcommand
+
+from wbc_baselines.learned.settings import Settings, TrainingError
+from wbc_bench.errors import BenchError
+
+RUNS = Path("runs")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Train one method with one seed; the same command resumes."""
+
+    settings: OmitArgPrefixes[Settings]
+    out: Path = RUNS
+    """Folder of runs; this one goes into OUT/METHOD@SEED."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.runs import RunFolder, run
+        from wbc_bench.progress import Progress
+
+        folder = RunFolder(self.out / self.settings.name)
+        with Progress("steps") as progress:
+            run(self.settings, folder, progress.update)
+        print(folder.path)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Train all methods x seeds at an equal budget; run it on several machines that share OUT, or again."""
+
+    settings: OmitArgPrefixes[Settings]
+    methods: tuple[str, ...] = ()
+    """Methods instead of --method; all when not given."""
+    seeds: int = 3
+    """Seeds 0 .. SEEDS - 1 instead of --seed."""
+    out: Path = RUNS
+    """Folder of runs."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.campaign import campaign, runs_of
+        from wbc_baselines.learned.methods import METHODS
+        from wbc_bench.progress import Progress
+
+        if self.seeds < 1:
+            raise TrainingError(f"--seeds {self.seeds}: valid: 1 or more")
+        chosen = runs_of(self.settings, self.methods or tuple(METHODS), self.seeds)
+        with Progress("steps") as progress:
+            for done in campaign(chosen, self.out, progress.update):
+                print(self.out / done.name, flush=True)
+
+
+@dataclass(frozen=True)
+class Status:
+    """Say what is done."""
+
+    out: Path = RUNS
+    """Folder of runs."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.campaign import standing
+        from wbc_bench.markup import Table
+
+        def share(value: float | None) -> str:
+            return "" if value is None else f"{100 * value:.1f}"
+
+        cells = [
+            (
+                s.name,
+                s.state,
+                f"{s.samples / 1e6:.1f}",
+                f"{s.seconds / 3600:.2f}",
+                share(s.success),
+                share(s.falls),
+            )
+            for s in standing(self.out)
+        ]
+        columns = ("Run", "State", "Samples (M)", "Hours", "Success (%)", "Falls (%)")
+        table = Table("status", f"Runs in {self.out}", columns, tuple(cells))
+        if sys.stdout.isatty():
+            from rich.console import Console
+
+            Console().print(table.rich())
+        else:
+            print(table.markdown())
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Draw the learning curves of all runs, PNG and SVG."""
+
+    out: Path = RUNS
+    """Folder of runs."""
+    figures: Path = Path("results/figures")
+    """Where the figures go."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.curves import write_curves
+
+        paths = write_curves(self.out, self.figures)
+        if not paths:
+            raise TrainingError(f"--out {self.out}: no run has metrics there, make one with `wbc-train run`")
+        for path in paths:
+            print(path)
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Draw the pool of feasible targets that training picks from (12,000: five minutes on two cores)."""
+
+    protocol: str = "ablation_v1"
+    """Whose targets."""
+    count: int = 12_000
+    """How many; the strata in turn."""
+    workers: int = 2
+    """Processes; the pool does not depend on it."""
+    path: Path | None = None
+    """Where to; the package's own folder when not given."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.pool import POOLS, draw_pool, write_pool
+        from wbc_bench.progress import Progress
+        from wbc_bench.protocol import find_protocol
+
+        if self.count < 3:
+            raise TrainingError(f"--count {self.count}: valid: 3 or more, one a stratum")
+        protocol, _ = find_protocol(self.protocol)
+        path = self.path or POOLS / f"{protocol.name}.parquet"
+        with Progress("targets") as progress:
+            pool = draw_pool(protocol, self.count, self.workers, progress.update)
+        write_pool(pool, protocol, path)
+        print(path)
+
+
+Command = (
+    Annotated[Run, subcommand("run")]
+    | Annotated[Campaign, subcommand("campaign")]
+    | Annotated[Status, subcommand("status")]
+    | Annotated[Curves, subcommand("curves")]
+    | Annotated[Targets, subcommand("targets")]
+)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point; exits with 2 on a mistake of the user and with 130 when interrupted."""
+    # a worker of torch that spins while it waits would take a core from the physics threads
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    command = tyro.cli(
+        Command, prog="wbc-train", description="Train the learned controllers.", args=arguments
+    )
+    try:
+        command.run()
+    except BenchError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted: the same command resumes at the last checkpoint", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,214 @@
+"""Every input of policy, critic and estimators: what stands in which column, and how it is put together.
+
+The layouts below are the only place that knows a dimension; `wbc-bench list --inputs` prints them.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from wbc_bench.robot import NUM_JOINTS
+
+if TYPE_CHECKING:  # the table is printed where torch is not installed
+    from torch import Tensor
+
+
+class Term(NamedTuple):
+    """Some neighbouring columns of a vector."""
+
+    name: str
+    size: int
+    unit: str
+
+
+Layout = tuple[Term, ...]
+ACTIONS = NUM_JOINTS
+HISTORY = 10  # control steps in the window. Source: paper, section III-C, H = 10
+
+_ANG_VEL = Term("base angular velocity, base frame", 3, "rad/s")
+_GRAVITY = Term("projected gravity, base frame", 3, "1")
+_JOINT_POS = Term("joint positions about the default posture", NUM_JOINTS, "rad")
+_JOINT_VEL = Term("joint velocities", NUM_JOINTS, "rad/s")
+_TORQUE = Term("joint torques", NUM_JOINTS, "N m")
+_EE_POS = Term("end-effector position, base frame", 3, "m")
+_EE_ROT = Term("end-effector rotation, base frame, first two columns", 6, "1")
+_FEET = Term("positions of left and right sole, base frame", 6, "m")
+
+OBSERVATION_LAYOUT: Layout = (  # Source: paper, Table I
+    *(_ANG_VEL, _GRAVITY, _JOINT_POS, _JOINT_VEL),
+    Term("previous action", ACTIONS, "1"),
+    *(_EE_POS, _EE_ROT),
+    Term("task-progress reference d_ref", 1, "1"),
+)
+COMMAND_LAYOUT: Layout = (  # Source: paper, eq. 1
+    Term("target position, base frame", 3, "m"),
+    Term("target rotation, base frame, first two columns", 6, "1"),
+)
+# Source: paper, section III-C
+HISTORY_LAYOUT: Layout = (_ANG_VEL, _GRAVITY, _JOINT_POS, _JOINT_VEL, _TORQUE, _EE_POS, _EE_ROT)
+NEXT_OBSERVATION_LAYOUT: Layout = (_ANG_VEL, _GRAVITY, _JOINT_POS, _JOINT_VEL, _EE_POS, _EE_ROT, _FEET)
+PRIVILEGED_LAYOUT: Layout = (  # Source: paper, section III-A, what the critic additionally receives
+    Term("base linear velocity, base frame", 3, "m/s"),
+    _TORQUE,
+    Term("joint accelerations over the last control period", NUM_JOINTS, "rad/s^2"),
+    Term("base height", 1, "m"),
+    Term("end-effector linear velocity, base frame", 3, "m/s"),
+    Term("end-effector angular velocity, base frame", 3, "rad/s"),
+    _FEET,
+    Term("kp factors", NUM_JOINTS, "1"),
+    Term("kd factors", NUM_JOINTS, "1"),
+    Term("mass added to the base", 1, "kg"),
+    Term("friction coefficient", 1, "1"),
+    Term("ground forces on left and right sole, world frame", 6, "N"),
+)
+
+
+def width(layout: Layout) -> int:
+    """Columns of a layout."""
+    return sum(term.size for term in layout)
+
+
+OBSERVATION = width(OBSERVATION_LAYOUT)
+COMMAND = width(COMMAND_LAYOUT)
+HISTORY_TERM = width(HISTORY_LAYOUT)
+NEXT_OBSERVATION = width(NEXT_OBSERVATION_LAYOUT)
+PRIVILEGED = width(PRIVILEGED_LAYOUT)
+VELOCITY, LATENT = 3, 64  # of the context z = (v, xi). Source: paper, Table I
+CONTEXT_MAX = VELOCITY + LATENT
+CONTEXT_LAYOUT: Layout = (
+    Term("estimated base linear velocity, base frame", VELOCITY, "m/s"),
+    Term(
+        "dynamics latent (16 in cenet; the oracle's context is the critic's privileged vector)", LATENT, "1"
+    ),
+)
+# Source: paper, Table I and section III
+assert (OBSERVATION, COMMAND, HISTORY_TERM, NEXT_OBSERVATION, CONTEXT_MAX) == (58, 9, 57, 49, 67)
+assert PRIVILEGED == 80
+
+LAYOUTS: dict[str, Layout] = {
+    "observation": OBSERVATION_LAYOUT,
+    "command": COMMAND_LAYOUT,
+    "context": CONTEXT_LAYOUT,
+    f"history term (window of {HISTORY})": HISTORY_LAYOUT,
+    "next observation (decoder's target, without noise)": NEXT_OBSERVATION_LAYOUT,
+    "privileged (critic and oracle, without noise)": PRIVILEGED_LAYOUT,
+}
+
+
+def _join(layout: Layout, *parts: "Tensor") -> "Tensor":
+    """The parts side by side, (N, width); each may span several neighbouring terms."""
+    import torch
+
+    joined = torch.cat(parts, dim=-1)
+    if joined.shape[-1] != width(layout):
+        sizes = " + ".join(str(part.shape[-1]) for part in parts)
+        raise ValueError(f"{sizes} columns, the layout has {' + '.join(str(term.size) for term in layout)}")
+    return joined
+
+
+def observation(
+    ang_vel_b: "Tensor",
+    gravity_b: "Tensor",
+    joint_pos_rel: "Tensor",
+    joint_vel: "Tensor",
+    previous_action: "Tensor",
+    ee: "Tensor",
+    d_ref: "Tensor",
+) -> "Tensor":
+    """What the actor sees of the robot, (N, 58); `ee` is position and two columns, (N, 9), d_ref (N,)."""
+    parts = (ang_vel_b, gravity_b, joint_pos_rel, joint_vel, previous_action, ee, d_ref[..., None])
+    return _join(OBSERVATION_LAYOUT, *parts)
+
+
+def command(target_pos_b: "Tensor", target_rot_b: "Tensor") -> "Tensor":
+    """The task, (N, 9), of positions (N, 3) [m] and rotation matrices (N, 3, 3). Source: paper, eq. 1."""
+    return _join(COMMAND_LAYOUT, target_pos_b, target_rot_b[..., :, 0], target_rot_b[..., :, 1])
+
+
+def history_term(
+    ang_vel_b: "Tensor",
+    gravity_b: "Tensor",
+    joint_pos_rel: "Tensor",
+    joint_vel: "Tensor",
+    joint_torque: "Tensor",
+    ee: "Tensor",
+) -> "Tensor":
+    """One step of an estimator's window, (N, 57)."""
+    return _join(HISTORY_LAYOUT, ang_vel_b, gravity_b, joint_pos_rel, joint_vel, joint_torque, ee)
+
+
+def next_observation(
+    ang_vel_b: "Tensor",
+    gravity_b: "Tensor",
+    joint_pos_rel: "Tensor",
+    joint_vel: "Tensor",
+    ee: "Tensor",
+    feet_b: "Tensor",
+) -> "Tensor":
+    """What a decoder predicts, (N, 49), from true values; feet_b (N, 6) [m], left then right."""
+    return _join(NEXT_OBSERVATION_LAYOUT, ang_vel_b, gravity_b, joint_pos_rel, joint_vel, ee, feet_b)
+
+
+def privileged(
+    base_lin_vel_b: "Tensor",
+    joint_torque: "Tensor",
+    joint_acc: "Tensor",
+    base_height: "Tensor",
+    ee_lin_vel_b: "Tensor",
+    ee_ang_vel_b: "Tensor",
+    feet_b: "Tensor",
+    kp_scale: "Tensor",
+    kd_scale: "Tensor",
+    base_mass: "Tensor",
+    friction: "Tensor",
+    foot_force_w: "Tensor",
+) -> "Tensor":
+    """What only a simulation knows, (N, 80), from true values; base_height, base_mass, friction are (N,).
+
+    The end-effector's velocity is that of the world, not relative to the base, written in the base frame.
+    """
+    return _join(
+        PRIVILEGED_LAYOUT,
+        *(
+            base_lin_vel_b,
+            joint_torque,
+            joint_acc,
+            base_height[..., None],
+            ee_lin_vel_b,
+            ee_ang_vel_b,
+            feet_b,
+        ),
+        *(kp_scale, kd_scale, base_mass[..., None], friction[..., None], foot_force_w),
+    )
+
+
+class History:
+    """The last HISTORY terms of N robots, oldest first.
+
+    An episode starts with its first term repeated (choice: the paper does not say).
+    """
+
+    def __init__(self, first: "Tensor") -> None:
+        """Windows of the first terms (N, 57)."""
+        self.window = first[:, None].repeat(1, HISTORY, 1)  # (N, HISTORY, 57)
+
+    def reset(self, ids: "Tensor", term: "Tensor") -> None:
+        """Start the robots `ids` (K,) anew from their first terms (K, 57)."""
+        self.window[ids] = term[:, None]
+
+    def push(self, term: "Tensor") -> None:
+        """Forget the oldest term and append one, (N, 57); the window of before stays as it was."""
+        import torch
+
+        self.window = torch.cat([self.window[:, 1:], term[:, None]], dim=1)
+
+
+def rows() -> list[tuple[str, ...]]:
+    """(vector, columns, size, term, unit) of every input, for `wbc-bench list --inputs`."""
+    found = []
+    for vector, layout in LAYOUTS.items():
+        start = 0
+        for term in layout:
+            columns = f"{start}..{start + term.size - 1}" if term.size > 1 else str(start)
+            found.append((vector, columns, str(term.size), term.name, term.unit))
+            start += term.size
+        found.append((vector, "all", str(start), "", ""))
+    return found

@@ -1,0 +1,42 @@
+"""The task-progress reference: a distance that only time shortens, and the phase it sets."""
+
+import torch
+from torch import Tensor
+
+GATE_SLOPE = 5.0  # k. Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
+GATE_CENTRE = 1.0  # mu, in the unit of d_ref. Source: as above
+
+
+def initial_reference(pos_err: Tensor, rot_err: Tensor) -> Tensor:
+    """d_ref (N,) at the start, of errors [m] and [rad]. Source: paper, eq. rfm_phase, first line."""
+    return 2 * pos_err + rot_err
+
+
+def advance(d_ref: Tensor, decay: Tensor | float, period: float) -> Tensor:
+    """d_ref (N,) one control period [s] later; decay [1/s]. Source: paper, eq. rfm_phase, second line."""
+    return (d_ref - decay * period).clamp(min=0.0)
+
+
+def gate(d_ref: Tensor, k: float = GATE_SLOPE, mu: float = GATE_CENTRE) -> Tensor:
+    """Phase g (N,): near 1 while approaching, near 0 at the target. Source: paper, eq. rfm_phase."""
+    return torch.sigmoid(k * (d_ref - mu))
+
+
+def rotation_from_rho6(rho6: Tensor) -> Tensor:
+    """Rotation matrices (N, 3, 3) nearest in Gram-Schmidt's sense to noisy columns (N, 6).
+
+    Source: Zhou et al. 2019, "On the Continuity of Rotation Representations", eq. 15.
+    """
+    x, y = rho6[..., :3], rho6[..., 3:]
+    x = torch.nn.functional.normalize(x, dim=-1)
+    y = torch.nn.functional.normalize(y - (x * y).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
+
+
+def pose_errors(pos: Tensor, rot: Tensor, target_pos: Tensor, target_rot: Tensor) -> tuple[Tensor, Tensor]:
+    """Position error (N,) [m] and geodesic angle (N,) [rad] of poses in one frame.
+
+    Source: paper, section III-D; ||a - b||_F = 2 sqrt(2) sin(angle / 2).
+    """
+    chord = torch.linalg.matrix_norm(rot - target_rot) / (2 * 2**0.5)
+    return torch.linalg.vector_norm(pos - target_pos, dim=-1), 2 * torch.arcsin(chord.clamp(max=1.0))

@@ -1,0 +1,262 @@
+"""The folder of a run: settings, metrics, resume state, final checkpoint. Every write is whole or absent."""
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wbc_baselines.learned.settings import Settings, TrainingError
+from wbc_bench.store import write_atomic
+
+if TYPE_CHECKING:
+    from wbc_baselines.learned.training import Trainer
+
+CHECKPOINT_PERIOD = 90.0  # [s] between resume files: what a kill can cost
+STALE = 900.0  # [s] without a sign of life after which a claim may be taken over
+FREE = frozenset({"budget", "threads"})  # settings that may differ when a run goes on
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Files of one run under `path`."""
+
+    path: Path
+
+    @property
+    def settings(self) -> Path:
+        return self.path / "settings.json"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON object an iteration; after a resume, the later line of an iteration counts."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def resume(self) -> Path:
+        return self.path / "resume.pt"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What an evaluation reads, `learned:PATH`; as old as the resume file."""
+        return self.path / f"{self.path.name}.safetensors"
+
+    @property
+    def claim(self) -> Path:
+        return self.path / "claim"
+
+    @property
+    def finished(self) -> Path:
+        """Written last, when budget and final checkpoint are there."""
+        return self.path / "finished.json"
+
+    def open(self, settings: Settings) -> None:
+        """Make the folder, or check that it belongs to these settings.
+
+        Raises:
+            TrainingError: it holds a run with other settings; they are listed.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        mine = asdict(settings)
+        if not self.settings.exists():
+            write_atomic(self.settings, json.dumps(mine, indent=2).encode())
+            return
+        theirs = json.loads(self.settings.read_text())
+        mine = json.loads(json.dumps(mine))  # tuples become lists
+        wrong = [
+            f"{name} {theirs.get(name)} -> {value}"
+            for name, value in mine.items()
+            if name not in FREE and theirs.get(name) != value
+        ]
+        if wrong:
+            raise TrainingError(
+                f"run '{self.path}' was started with other settings: {', '.join(wrong)}; "
+                "valid: the same, or another --out"
+            )
+        write_atomic(self.settings, json.dumps(mine, indent=2).encode())
+
+    def read_metrics(self) -> list[dict]:
+        """Metrics by iteration; a line that a kill has cut short is left out."""
+        if not self.metrics.exists():
+            return []
+        rows = {}
+        for line in self.metrics.read_text().splitlines():
+            try:
+                row = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            rows[row["iteration"]] = row
+        return [rows[key] for key in sorted(rows)]
+
+    def append(self, row: dict) -> None:
+        """Add one iteration's metrics."""
+        with self.metrics.open("a+b") as file:
+            if file.tell() and not _ends_with_newline(file):
+                file.write(b"\n")  # the line before was cut short
+            file.write(json.dumps(row).encode() + b"\n")
+
+    def take(self) -> bool:
+        """Claim the run for this process; False if another, living one has it."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            with self.claim.open("x") as file:
+                file.write(_me())
+            return True
+        except FileExistsError:
+            pass
+        try:
+            idle = time.time() - self.claim.stat().st_mtime
+        except FileNotFoundError:
+            return self.take()
+        if idle < STALE and not self._is_dead():
+            return False
+        # of several that want it, the one whose rename succeeds gets it
+        old = self.claim.with_name(f"claim.old.{socket.gethostname()}.{os.getpid()}")
+        try:
+            self.claim.rename(old)
+        except FileNotFoundError:
+            return False
+        old.unlink()
+        return self.take()
+
+    def _is_dead(self) -> bool:
+        """Whether the claim is of a process of this machine that has ended."""
+        host, _, pid = self.claim.read_text().partition(" ")
+        return host == socket.gethostname() and pid.isdigit() and not Path(f"/proc/{pid}").exists()
+
+    def touch(self) -> None:
+        """A sign of life."""
+        self.claim.touch()
+
+    def release(self) -> None:
+        """Give the claim back."""
+        self.claim.unlink(missing_ok=True)
+
+
+def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
+    """Write checkpoint and resume file; `seconds` of training so far."""
+    import io
+
+    import torch
+
+    trainer.write_checkpoint(folder.checkpoint, seconds)
+    buffer = io.BytesIO()
+    torch.save(trainer.save() | {"seconds": seconds}, buffer)
+    write_atomic(folder.resume, buffer.getvalue())
+
+
+def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
+    """Continue from the resume file, if there is one; seconds of training before.
+
+    Raises:
+        TrainingError: the file cannot be read.
+    """
+    import pickle
+    import zipfile
+
+    import torch
+
+    if not folder.resume.exists():
+        return 0.0
+    try:
+        saved = torch.load(folder.resume, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        raise TrainingError(f"resume file '{folder.resume}' cannot be read: {error}") from error
+    trainer.load(saved)
+    return saved["seconds"]
+
+
+def run(
+    settings: Settings,
+    folder: RunFolder,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    tensorboard: bool = True,
+) -> None:
+    """Train from wherever the folder stands to the budget, and write the final checkpoint.
+
+    Raises:
+        TrainingError: see `RunFolder.open`, `load_resume`, `Trainer.iterate`; or another process has the run.
+    """
+    from wbc_baselines.learned.training import Trainer, make_environment
+
+    settings.check()
+    folder.open(settings)
+    if not folder.take():
+        raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
+    try:
+        trainer = Trainer(settings, make_environment(settings))
+        before = load_resume(trainer, folder)
+        started, first = time.monotonic() - before, trainer.samples
+        saved = time.monotonic()
+        writer = _writer(folder, trainer.iteration) if tensorboard else None
+        per_iteration = settings.envs * settings.steps
+        with _stop_requests() as stop:
+            while not trainer.done:
+                metrics = trainer.iterate()
+                seconds = time.monotonic() - started
+                rate = per_iteration / sum(metrics[f"time/{k}"] for k in ("rollout", "policy", "estimator"))
+                row = {"iteration": trainer.iteration, "samples": trainer.samples, "seconds": seconds}
+                folder.append(row | {k: None if v != v else float(v) for k, v in metrics.items()})
+                if writer:
+                    for name, value in metrics.items():
+                        writer.add_scalar(name, value, trainer.samples)
+                progress(trainer.samples - first, int(settings.budget) - first, line(trainer, metrics, rate))
+                if stop or trainer.done or time.monotonic() - saved > CHECKPOINT_PERIOD:
+                    save_resume(trainer, folder, seconds)
+                    saved = time.monotonic()
+                    folder.touch()
+                if stop:
+                    raise KeyboardInterrupt
+        note = {"samples": trainer.samples, "seconds": time.monotonic() - started}
+        write_atomic(folder.finished, json.dumps(note).encode())
+        if writer:
+            writer.close()
+    finally:
+        folder.release()
+
+
+@contextmanager
+def _stop_requests() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop, so that it can save; a second ask is obeyed."""
+    asked: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def line(trainer: "Trainer", metrics: dict[str, float], rate: float) -> str:
+    """How training stands, for a progress line."""
+    share = {name: metrics[f"episode/{name}"] for name in ("success", "falls")}
+    return (
+        f"{trainer.settings.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
+        f"return {metrics['episode/return']:.1f}, success {share['success']:.1%}, falls {share['falls']:.1%}"
+    )
+
+
+def _writer(folder: RunFolder, iteration: int):
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration or None)
+
+
+def _ends_with_newline(file) -> bool:
+    file.seek(-1, os.SEEK_END)
+    return file.read(1) == b"\n"
+
+
+def _me() -> str:
+    return f"{socket.gethostname()} {os.getpid()}"

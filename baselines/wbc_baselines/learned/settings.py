@@ -1,0 +1,108 @@
+"""The settings of a training run."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from wbc_baselines.learned.methods import METHODS
+from wbc_bench.errors import BenchError, UnknownNameError
+
+
+class TrainingError(BenchError):
+    """A run that cannot be started, resumed or continued."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that what a run learns depends on; a run resumes with the same ones only."""
+
+    method: str
+    """A method of the study: no_latent, cenet, gru, transformer, transformer_gru, oracle, ..."""
+    seed: int = 0
+    """Seed of weights and draws."""
+    budget: float = 60e6
+    """Control steps to train on, over all environments."""
+    protocol: str = "ablation_v1"
+    """Whose targets, randomisation, noise, pushes and terminations are trained on."""
+    envs: int = 1024
+    """Environments side by side."""
+    steps: int = 24
+    """Control steps of a rollout."""
+    epochs: int = 2
+    """Passes of PPO over a rollout."""
+    minibatches: int = 8
+    """Parts of a rollout in one pass."""
+    learning_rate: float = 3e-4
+    """At the start; then adapted to `desired_kl`."""
+    least_learning_rate: float = 1e-4
+    """Below which it is not adapted."""
+    desired_kl: float = 0.01
+    """KL divergence of an update that the learning rate aims at."""
+    entropy: tuple[float, float] = (0.01, 0.0005)
+    """Entropy bonus at the start and at the end of the budget, linear in between."""
+    gamma: float = 0.99
+    """Discount of a control step."""
+    lam: float = 0.95
+    """Lambda of the generalised advantage estimate."""
+    clip: float = 0.2
+    """PPO's clip."""
+    gradient_norm: float = 1.0
+    """Largest norm of a gradient."""
+    std_legs: float = 0.4
+    """Standard deviation of the leg actions at the start."""
+    std_arm: float = 1.0
+    """Standard deviation of the arm actions at the start."""
+    timestep: float = 0.01
+    """[s] of the physics; an evaluation always takes the protocol's."""
+    decimation: int = 2
+    """Physics steps in a control period."""
+    curriculum: float = 0.0
+    """Part of the budget over which the strata ramp from mostly `arm` to the protocol's weights."""
+    estimator_share: float = 0.125
+    """Part of the environments whose rollouts train the estimator; drawn anew each iteration."""
+    estimator_minibatches: int = 4
+    """Updates of the estimator in an iteration, each on whole rollouts of its own environments."""
+    estimator_learning_rate: float = 1e-3
+    """Of the estimator's Adam."""
+    backend: Literal["cpu", "warp"] = "cpu"
+    """mujoco.batch on a CPU, or mujoco_warp on a GPU."""
+    threads: int = 2
+    """Threads of physics and of torch on a CPU."""
+
+    @property
+    def name(self) -> str:
+        """METHOD@SEED."""
+        return f"{self.method}@{self.seed}"
+
+    @property
+    def iterations(self) -> int:
+        """Whole rollouts that reach the budget."""
+        return math.ceil(self.budget / (self.envs * self.steps))
+
+    def check(self) -> None:
+        """Refuse what cannot be run.
+
+        Raises:
+            UnknownNameError: no such method.
+            TrainingError: a number out of its range.
+        """
+        if self.method not in METHODS:
+            raise UnknownNameError("method", self.method, METHODS, "--method")
+        for name in ("budget", "envs", "steps", "epochs", "minibatches", "estimator_minibatches", "threads"):
+            if getattr(self, name) < 1:
+                option = name.replace("_", "-")
+                raise TrainingError(f"--{option} {getattr(self, name)}: valid: 1 or more")
+        if self.envs * self.steps < self.minibatches:
+            raise TrainingError(
+                f"--minibatches {self.minibatches}: valid: 1 to {self.envs * self.steps} (envs x steps)"
+            )
+        if self.estimator_minibatches > self.estimator_envs:
+            raise TrainingError(
+                f"--estimator-minibatches {self.estimator_minibatches}: valid: 1 to {self.estimator_envs} "
+                "(envs x estimator-share)"
+            )
+
+    @property
+    def estimator_envs(self) -> int:
+        """Environments whose rollouts train the estimator."""
+        return max(1, round(self.envs * self.estimator_share))

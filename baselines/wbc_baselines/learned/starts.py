@@ -1,0 +1,76 @@
+"""What an episode of training draws: the evaluation's quantities and ranges, many episodes at once."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wbc_baselines.learned.backends.base import Start
+from wbc_baselines.learned.pool import TargetPool
+from wbc_bench.episodes import STRATA
+from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
+from wbc_bench.randomization import resting_height
+from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS
+
+Array = NDArray[np.float64]
+DECAY = (0.5, 1.4)  # [1/s] v_ref in training. Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
+# Shares of arm, posture and step at the start of a curriculum; choice. It ends at the protocol's weights.
+FIRST_SHARES = np.array([0.6, 0.3, 0.1])
+
+
+class Draws(NamedTuple):
+    """K episodes."""
+
+    start: Start
+    target: NDArray[np.int64]  # (K,) row of the pool
+    decay: Array  # (K,) [1/s]
+    push_step: NDArray[np.int64]  # (K, MAX_PUSHES) control step before which it comes, -1 for none
+    push_vel: Array  # (K, MAX_PUSHES, 2) [m/s]
+
+
+def shares(protocol: EvalProtocol, curriculum: float) -> Array:
+    """Shares (3,) of the strata when a part `curriculum` in [0, 1] of the ramp is done."""
+    assert isinstance(protocol.targets, WorkspaceTargets)
+    weights = protocol.targets.weights
+    last = np.array([float(weights.get(name, 0)) for name in STRATA])
+    return FIRST_SHARES * (1 - curriculum) + last / last.sum() * curriculum
+
+
+def draw_starts(
+    protocol: EvalProtocol, pool: TargetPool, count: int, rng: np.random.Generator, curriculum: float = 1.0
+) -> Draws:
+    """`count` episodes; the distributions are those of an evaluation's manifest (wbc_bench.randomization)."""
+    spread = protocol.randomization
+    leg_q = rng.uniform(-spread.leg_q, spread.leg_q, (count, NUM_LEG_JOINTS))
+    velocity = np.repeat([spread.base_lin_vel, spread.base_ang_vel], 3)
+    push_step, push_vel = draw_pushes(protocol, count, rng)
+    start = Start(
+        base_height=np.array([resting_height(protocol.robot, q) for q in leg_q]),
+        friction=rng.uniform(*spread.friction, count),
+        base_mass=rng.uniform(*spread.base_mass, count),
+        base_vel=rng.uniform(-velocity, velocity, (count, 6)),
+        leg_q=leg_q,
+        leg_qd=rng.uniform(-spread.leg_qd, spread.leg_qd, (count, NUM_LEG_JOINTS)),
+        kp_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
+        kd_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
+    )
+    share, target = shares(protocol, curriculum), np.empty(count, dtype=np.int64)
+    stratum = rng.choice(len(STRATA), count, p=share)
+    within = rng.random(count)
+    for k in range(len(STRATA)):
+        members = np.flatnonzero(pool.stratum == k)
+        mine = stratum == k
+        target[mine] = members[(within[mine] * len(members)).astype(np.int64)]
+    return Draws(start, target, rng.uniform(*DECAY, count), push_step, push_vel)
+
+
+def draw_pushes(
+    protocol: EvalProtocol, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array]:
+    """Steps (count, MAX_PUSHES) and jumps (count, MAX_PUSHES, 2) [m/s], as `randomization.draw_pushes`."""
+    push: Push = protocol.push
+    time = np.cumsum(rng.uniform(*push.interval, (count, MAX_PUSHES)), axis=1)
+    velocity = rng.uniform(-push.speed, push.speed, (count, MAX_PUSHES, 2))
+    none = (time >= protocol.episodes.horizon - push.quiet_end) | (push.speed == 0)
+    step = np.where(none, -1, np.round(time / protocol.control_period)).astype(np.int64)
+    return step, np.where(none[..., None], 0.0, velocity)

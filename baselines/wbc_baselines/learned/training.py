@@ -1,0 +1,348 @@
+"""PPO on the environment, the estimator beside it on its own losses.
+
+rsl-rl-lib's PPO is used as it is: the context enters as an observation group, written at rollout time without
+a gradient, so no update of the policy can reach the estimator. All randomness of an iteration comes from the
+seed and the iteration's number, so between two iterations no generator has a state worth keeping.
+"""
+
+import time
+import zlib
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor
+
+from wbc_baselines.learned import checkpoint
+from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment, Step
+from wbc_baselines.learned.estimators import Batch, make_estimator
+from wbc_baselines.learned.inputs import ACTIONS, HISTORY, HISTORY_TERM, NEXT_OBSERVATION, History
+from wbc_baselines.learned.methods import METHODS
+from wbc_baselines.learned.networks import HIDDEN, Actor
+from wbc_baselines.learned.pool import TargetPool, read_pool
+from wbc_baselines.learned.settings import Settings, TrainingError
+from wbc_bench.protocol import EvalProtocol, find_protocol
+from wbc_bench.robot import NUM_LEG_JOINTS
+
+
+def training_protocol(settings: Settings) -> EvalProtocol:
+    """The protocol with the physics step of training.
+
+    Raises:
+        TrainingError: the control period would not be the protocol's.
+    """
+    protocol, _ = find_protocol(settings.protocol)
+    physics = msgspec.structs.replace(
+        protocol.physics, timestep=settings.timestep, decimation=settings.decimation
+    )
+    changed = msgspec.structs.replace(protocol, physics=physics)
+    if abs(changed.control_period - protocol.control_period) > 1e-9:
+        raise TrainingError(
+            f"--timestep {settings.timestep:g} s x --decimation {settings.decimation}: valid: a product of "
+            f"{protocol.control_period:g} s, the control period of {protocol.name}"
+        )
+    return changed
+
+
+def make_environment(settings: Settings, pool: TargetPool | None = None) -> Environment:
+    """The environment of a run; the pool that ships, if none is given."""
+    protocol = training_protocol(settings)
+    if settings.backend == "warp":
+        from wbc_baselines.learned.backends.warp import WarpBackend
+
+        backend = WarpBackend(protocol, settings.envs)
+    else:
+        from wbc_baselines.learned.backends.cpu import CpuBackend
+
+        backend = CpuBackend(protocol, settings.envs, settings.threads)
+    if pool is None:
+        pool = read_pool(find_protocol(settings.protocol)[0])
+    return Environment(protocol, backend, pool, METHODS[settings.method].reward, settings.seed)
+
+
+class Rollout:
+    """What the estimator learns from: the rollouts of some of the environments, time first."""
+
+    def __init__(self, steps: int, ids: Tensor, state: Tensor) -> None:
+        self.ids, self.state = ids, state[ids]
+        shape = (steps, len(ids))
+        self.history = torch.empty(*shape, HISTORY, HISTORY_TERM, device=ids.device)
+        self.start = torch.empty(shape, dtype=torch.bool, device=ids.device)
+        self.velocity = torch.empty(*shape, 3, device=ids.device)
+        self.next_observation = torch.empty(*shape, NEXT_OBSERVATION, device=ids.device)
+        self.valid = torch.empty(shape, dtype=torch.bool, device=ids.device)
+
+    def before(self, t: int, window: Tensor, start: Tensor, velocity: Tensor) -> None:
+        """What is known when step t begins."""
+        self.history[t], self.start[t] = window[self.ids], start[self.ids]
+        self.velocity[t] = velocity[self.ids]
+
+    def after(self, t: int, step: Step) -> None:
+        """What step t has shown."""
+        self.next_observation[t] = step.seen.next_observation[self.ids]
+        self.valid[t] = ~step.done[self.ids]
+
+    def batches(self, count: int) -> Iterator[Batch]:
+        """The rollout in `count` parts, environments apart and sequences whole."""
+        for part in torch.arange(len(self.ids), device=self.ids.device).chunk(count):
+            yield Batch(
+                self.history[:, part],
+                self.state[part],
+                self.start[:, part],
+                self.velocity[:, part],
+                self.next_observation[:, part],
+                self.valid[:, part],
+            )
+
+
+class Trainer:
+    """One run: networks, optimisers and environment, advanced an iteration at a time."""
+
+    def __init__(self, settings: Settings, environment: Environment) -> None:
+        settings.check()
+        self.settings, self.environment = settings, environment
+        self.method = METHODS[settings.method]
+        self.iteration, self.device = 0, environment.device
+        if settings.backend == "cpu":
+            torch.set_num_threads(settings.threads)
+        torch.manual_seed(_key(settings.seed, "weights"))
+        self.estimator = make_estimator(self.method.estimator).to(self.device)
+        self._privileged = self.method.estimator == "oracle"
+        self._estimates = self.estimator.context_dim > 0 and not self._privileged
+        seen = environment.seen
+        self._history = History(seen.term)
+        self._state = torch.zeros(environment.num_envs, self.estimator.state_dim, device=self.device)
+        self._start = torch.ones(environment.num_envs, dtype=torch.bool, device=self.device)
+        self._context = self._estimate() if self._estimates else None
+        self.ppo = self._make_ppo()
+        parameters = list(self.estimator.parameters())
+        self.optimizer = (
+            torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
+        )
+
+    def _make_ppo(self) -> PPO:
+        settings, seen = self.settings, self._observations()
+        # the critic sees what the oracle's context holds already
+        groups = {"actor": ["policy"], "critic": ["critic"]}
+        if self.estimator.context_dim:
+            groups["actor"].append("context")
+        if self._estimates:
+            groups["critic"].append("context")
+        gaussian = {"class_name": "GaussianDistribution", "std_type": "log"}
+        common = {"hidden_dims": HIDDEN, "activation": "elu", "obs_normalization": True}
+        actor = MLPModel(seen, groups, "actor", ACTIONS, distribution_cfg=gaussian, **common)
+        critic = MLPModel(seen, groups, "critic", 1, **common)
+        std = torch.full((ACTIONS,), settings.std_arm)
+        std[:NUM_LEG_JOINTS] = settings.std_legs
+        with torch.no_grad():
+            actor.distribution.log_std_param.copy_(std.log())  # type: ignore[union-attr]
+        storage = RolloutStorage("rl", settings.envs, settings.steps, seen, [ACTIONS], str(self.device))
+        ppo = PPO(
+            actor,
+            critic,
+            storage,
+            num_learning_epochs=settings.epochs,
+            num_mini_batches=settings.minibatches,
+            clip_param=settings.clip,
+            gamma=settings.gamma,
+            lam=settings.lam,
+            entropy_coef=settings.entropy[0],
+            learning_rate=settings.learning_rate,
+            max_grad_norm=settings.gradient_norm,
+            use_clipped_value_loss=False,
+            schedule="adaptive",
+            desired_kl=settings.desired_kl,
+            device=str(self.device),
+        )
+        least = settings.least_learning_rate
+
+        def floor(optimizer: torch.optim.Optimizer, *_: object) -> None:
+            for group in optimizer.param_groups:
+                group["lr"] = max(group["lr"], least)
+            ppo.learning_rate = max(ppo.learning_rate, least)
+
+        # PPO has no option for the least learning rate
+        ppo.optimizer.register_step_pre_hook(floor)
+        return ppo
+
+    # ---- one iteration -------------------------------------------------------------------------------------
+
+    @property
+    def samples(self) -> int:
+        """Control steps so far."""
+        return self.iteration * self.settings.envs * self.settings.steps
+
+    @property
+    def done(self) -> bool:
+        """Whether the budget is used up."""
+        return self.iteration >= self.settings.iterations
+
+    def iterate(self) -> dict[str, float]:
+        """Roll out, update policy and estimator; what is worth logging, by name."""
+        settings, environment, ppo = self.settings, self.environment, self.ppo
+        part = self.iteration / settings.iterations
+        torch.manual_seed(_key(settings.seed, "iteration", self.iteration))
+        ppo.entropy_coef = settings.entropy[0] + part * (settings.entropy[1] - settings.entropy[0])
+        environment.curriculum = min(1.0, part / settings.curriculum) if settings.curriculum else 1.0
+        environment.clear_log()
+        environment.begin_rollout(self.iteration, settings.steps)
+        clock = [time.perf_counter()]
+        rollout = self._roll_out()
+        clock.append(time.perf_counter())
+        with torch.no_grad():
+            ppo.compute_returns(self._observations())
+        losses = ppo.update()
+        clock.append(time.perf_counter())
+        losses |= self._update_estimator(rollout) if rollout else {}
+        clock.append(time.perf_counter())
+        self.iteration += 1
+        found = {f"loss/{name}": float(value) for name, value in losses.items()}
+        wrong = [name for name, value in found.items() if value != value or abs(value) == float("inf")]
+        if wrong:
+            raise TrainingError(
+                f"run {settings.name}: {', '.join(wrong)} is not finite in iteration {self.iteration}; "
+                "the last checkpoint is sound: resume with a smaller --learning-rate or another --seed"
+            )
+        seconds = [b - a for a, b in pairwise(clock)]
+        found |= dict(zip(("time/rollout", "time/policy", "time/estimator"), seconds, strict=True))
+        std = ppo.actor.distribution.log_std_param.detach().exp()  # type: ignore[union-attr]
+        found |= {
+            "policy/std_legs": float(std[:NUM_LEG_JOINTS].mean()),
+            "policy/std_arm": float(std[NUM_LEG_JOINTS:].mean()),
+            "policy/learning_rate": ppo.learning_rate,
+            "policy/entropy_bonus": ppo.entropy_coef,
+        }
+        return found | environment.log()
+
+    @torch.no_grad()
+    def _roll_out(self) -> Rollout | None:
+        settings, environment, ppo = self.settings, self.environment, self.ppo
+        ppo.train_mode()
+        rollout = None
+        if self.optimizer:
+            ids = torch.randperm(settings.envs, device=self.device)[: settings.estimator_envs]
+            rollout = Rollout(settings.steps, ids, self._state_before)
+        observations = self._observations()
+        for t in range(settings.steps):
+            if rollout:
+                rollout.before(t, self._history.window, self._start, environment.seen.velocity)
+            action = ppo.act(observations)
+            step = environment.step(action)
+            if rollout:
+                rollout.after(t, step)
+            if self._estimates:
+                self._advance_context(step)
+            observations = self._observations()
+            ppo.process_env_step(observations, step.reward, step.done, {"time_outs": step.time_out})
+        return rollout
+
+    def _advance_context(self, step: Step) -> None:
+        self._history.push(step.seen.term)
+        ids = step.done.nonzero()[:, 0]
+        if len(ids):
+            self._history.reset(ids, step.seen.term[ids])
+            self._state[ids] = 0.0
+        self._start = step.done
+        self._context = self._estimate()
+
+    @torch.no_grad()
+    def _estimate(self) -> Tensor:
+        """The sampled context of the windows. Source: paper, eq. estimated_context."""
+        self._state_before = self._state
+        noise = torch.randn(len(self._state), self.estimator.latent_dim, device=self.device)
+        context, self._state = self.estimator.step(self._history.window, self._state, noise)
+        return context
+
+    def _observations(self) -> TensorDict:
+        seen = self.environment.seen
+        groups = {"policy": seen.policy, "critic": seen.critic}
+        if self._privileged:
+            groups["context"] = seen.critic[:, PRIVILEGED_COLUMNS]
+        elif self._context is not None:
+            groups["context"] = self._context
+        return TensorDict(groups, batch_size=[self.environment.num_envs], device=self.device)
+
+    def _update_estimator(self, rollout: Rollout) -> dict[str, float]:
+        assert self.optimizer is not None
+        settings, sums = self.settings, {}
+        for batch in rollout.batches(settings.estimator_minibatches):
+            noise = torch.randn(*batch.start.shape, self.estimator.latent_dim, device=self.device)
+            losses = self.estimator.losses(batch, noise)
+            self.optimizer.zero_grad()
+            losses["total"].backward()
+            torch.nn.utils.clip_grad_norm_(self.estimator.parameters(), settings.gradient_norm)
+            self.optimizer.step()
+            for name, value in losses.items():
+                sums[f"estimator_{name}"] = sums.get(f"estimator_{name}", 0.0) + value.detach()
+        self.estimator.observe(rollout.history)
+        return {name: float(value) / settings.estimator_minibatches for name, value in sums.items()}
+
+    # ---- networks for an evaluation, and everything for a resume -------------------------------------------
+
+    def actor(self) -> Actor:
+        """The policy's mean, in the form of an evaluation."""
+        trained, actor = self.ppo.actor, Actor(self.estimator.context_dim)
+        weights = {f"mlp.{name}": value for name, value in trained.mlp.state_dict().items()}
+        normalizer = trained.obs_normalizer
+        actor.load_state_dict(
+            weights | {"normalizer.mean": normalizer.mean, "normalizer.std": normalizer.std}
+        )
+        return actor.eval()
+
+    def write_checkpoint(self, path: Path, seconds: float) -> None:
+        """Write what an evaluation needs, with its card; `seconds` of training so far."""
+        settings = self.settings
+        protocol, _ = find_protocol(settings.protocol)
+        card = checkpoint.new_card(settings.method, settings.seed, self.samples, seconds, protocol)
+        checkpoint.save(path, self.actor(), self.estimator, card)
+
+    def save(self) -> dict:
+        """Everything that the next iterations depend on, as tensors and numbers."""
+        counts = {
+            name: value for name, value in self.estimator.named_buffers() if name.endswith("normalizer.count")
+        }
+        return {
+            "iteration": self.iteration,
+            "ppo": self.ppo.save(),
+            "learning_rate": self.ppo.learning_rate,
+            "estimator": self.estimator.state_dict() | counts,
+            "optimizer": self.optimizer.state_dict() if self.optimizer else {},
+            "environment": self.environment.save(),
+            "history": self._history.window,
+            "state": self._state,
+            "state_before": self._state_before if self._estimates else self._state,
+            "start": self._start,
+            "context": self._context if self._context is not None else torch.zeros(0),
+        }
+
+    def load(self, saved: dict) -> None:
+        """Go on from what `save` returned, bit by bit."""
+        self.iteration = saved["iteration"]
+        self.ppo.load(saved["ppo"], None, strict=True)
+        self.ppo.learning_rate = saved["learning_rate"]
+        buffers = dict(self.estimator.named_buffers())
+        for name, value in saved["estimator"].items():
+            if name.endswith("normalizer.count"):
+                buffers[name].copy_(value)
+        self.estimator.load_state_dict(
+            {k: v for k, v in saved["estimator"].items() if not k.endswith("normalizer.count")}
+        )
+        if self.optimizer:
+            self.optimizer.load_state_dict(saved["optimizer"])
+        self.environment.load(saved["environment"])
+        self._history.window = saved["history"].to(self.device)
+        self._state, self._start = saved["state"].to(self.device), saved["start"].to(self.device)
+        self._state_before = saved["state_before"].to(self.device)
+        if self._estimates:
+            self._context = saved["context"].to(self.device)
+
+
+def _key(seed: int, purpose: str, index: int = 0) -> int:
+    """A seed for torch's generator: of one purpose and iteration, and of no other."""
+    return ((seed & 0xFFFF) << 48) | ((zlib.crc32(purpose.encode()) & 0xFFFF) << 32) | (index & 0xFFFFFFFF)

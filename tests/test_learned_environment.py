@@ -1,0 +1,364 @@
+"""Training's environment is the evaluation's: same physics, draws, observations, endings; resets in place."""
+
+import hashlib
+from dataclasses import fields
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from torch import Tensor  # noqa: E402
+
+from wbc_baselines.learned import inputs  # noqa: E402
+from wbc_baselines.learned.backends.base import Start  # noqa: E402
+from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
+from wbc_baselines.learned.environment import Environment, noise_half_widths, rotation_from_wxyz  # noqa: E402
+from wbc_baselines.learned.pool import POOLS, TargetPool, digest, draw_pool, read_pool, write_pool  # noqa: E402
+from wbc_baselines.learned.starts import DECAY, FIRST_SHARES, draw_pushes, draw_starts, shares  # noqa: E402
+from wbc_bench import randomization  # noqa: E402
+from wbc_bench.episodes import STRATA  # noqa: E402
+from wbc_bench.errors import ManifestError  # noqa: E402
+from wbc_bench.manifest import EpisodeManifest  # noqa: E402
+from wbc_bench.observation import Sensors  # noqa: E402
+from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
+from wbc_bench.randomness import stream  # noqa: E402
+from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_bench.rotations import matrix_from_wxyz  # noqa: E402
+from wbc_bench.simulation import Simulation  # noqa: E402
+
+PROTOCOL = find_protocol("ablation_v1")[0]
+POOL = read_pool(PROTOCOL)
+N = 6
+
+
+def coarse(protocol: EvalProtocol = PROTOCOL, **changes) -> EvalProtocol:
+    """Physics of 10 ms, and other changes."""
+    physics = msgspec.structs.replace(protocol.physics, timestep=0.01, decimation=2)
+    return msgspec.structs.replace(protocol, physics=physics, **changes)
+
+
+def environment(
+    protocol: EvalProtocol | None = None, count: int = N, seed: int = 0, threads: int = 1
+) -> Environment:
+    protocol = protocol or coarse()
+    return Environment(protocol, CpuBackend(protocol, count, threads), POOL, "gated", seed)
+
+
+def actions(steps: int, count: int = N, scale: float = 0.3) -> Tensor:
+    return scale * torch.randn(steps, count, 14, generator=torch.Generator().manual_seed(1))
+
+
+def manifest_of(start: Start, target: np.ndarray) -> EpisodeManifest:
+    """A manifest of the same episodes as a training start's."""
+    count = len(start.friction)
+    columns: dict[str, Any] = {field.name: np.zeros(count) for field in fields(EpisodeManifest)}
+    columns |= start._asdict()
+    columns |= {
+        "target_pos_w": POOL.pos_w[target].astype(float),
+        "target_quat_w": POOL.quat_w[target].astype(float),
+        "push_time": np.full((count, MAX_PUSHES), np.nan),
+        "push_vel": np.zeros((count, 2 * MAX_PUSHES)),
+        "noise_key": np.arange(count),
+    }
+    return EpisodeManifest(**columns)
+
+
+def test_the_physics_is_the_evaluations():
+    """The same starts and commands, 0.3 s at 2 ms x 10, through both simulations: equal but for float32."""
+    draws = draw_starts(PROTOCOL, POOL, N, stream(3, "test"))
+    backend = CpuBackend(PROTOCOL, N, 1)
+    simulation = Simulation(PROTOCOL, manifest_of(draws.start, draws.target))
+    state = backend.reset(np.arange(N), draws.start)
+    robot = load_robot(PROTOCOL.robot)
+    for action in actions(15):
+        command = torch.tensor(robot.command_of(action.double().numpy()), dtype=torch.float32)
+        state = backend.step(command)
+        simulation.step(command.double().numpy(), np.ones(N, dtype=bool))
+    truth = simulation.state()
+    for mine, theirs in (
+        (state.qpos[:, 7:], truth.joint_pos),
+        (state.qvel[:, 6:], truth.joint_vel),
+        (state.qpos[:, :3], truth.base_pos_w),
+        (rotation_from_wxyz(state.qpos[:, 3:7]), truth.base_rot_w),
+        (state.torque, truth.joint_torque),
+        (state.ee_pos_w, truth.ee_pos_w),
+        (state.ee_rot_w, truth.ee_rot_w),
+        (state.foot_force_w, truth.foot_force_w),
+        (state.ground_contact, truth.ground_contact),
+    ):
+        np.testing.assert_allclose(mine.numpy(), theirs, rtol=2e-6, atol=2e-6)
+
+
+def test_observations_are_the_evaluations():
+    """Without noise, every column is what the evaluation's sensors say of the same state."""
+    protocol = coarse(noise=Noise())
+    env = environment(protocol)
+    env.begin_rollout(0, 4)
+    for action in actions(4):
+        env.step(action)
+    state, episode, seen = env._state, env._episode, env.seen
+    draws = draw_starts(PROTOCOL, POOL, N, stream(3, "test"))
+    rows = manifest_of(draws.start, draws.target)
+    rows.target_pos_w[:] = episode.target_pos_w.numpy()
+    sensors = Sensors(protocol, rows, frozenset({"proprioception", "ee_pose", "privileged"}))
+    from wbc_bench.simulation import State as Truth
+
+    truth = Truth(
+        base_pos_w=state.qpos[:, :3].double().numpy(),
+        base_rot_w=matrix_from_wxyz(state.qpos[:, 3:7].double().numpy()),
+        base_lin_vel_w=state.qvel[:, :3].double().numpy(),
+        base_ang_vel_b=state.qvel[:, 3:6].double().numpy(),
+        joint_pos=state.qpos[:, 7:].double().numpy(),
+        joint_vel=state.qvel[:, 6:].double().numpy(),
+        joint_torque=state.torque.double().numpy(),
+        ee_pos_w=state.ee_pos_w.double().numpy(),
+        ee_rot_w=state.ee_rot_w.double().numpy(),
+        foot_force_w=state.foot_force_w.double().numpy(),
+        ground_contact=state.ground_contact.numpy(),
+        diverged=state.diverged.numpy(),
+    )
+    active = np.ones(N, dtype=bool)
+    seen_by_bench = sensors.observe(4, 0.08, truth, active)
+    body, ee, privileged = seen_by_bench.proprioception, seen_by_bench.ee_pose, seen_by_bench.privileged
+    assert body and ee and privileged
+    default = load_robot().default_q
+    ee9 = np.concatenate([ee.pos_b, ee.rot6_b], axis=1)
+    common = [body.base_ang_vel_b, body.gravity_b, body.joint_pos - default, body.joint_vel]
+    expected = np.concatenate([*common, episode.action.numpy(), ee9, episode.d_ref[:, None].numpy()], axis=1)
+    np.testing.assert_allclose(seen.policy[:, : inputs.OBSERVATION].numpy(), expected, atol=2e-5)
+    np.testing.assert_allclose(seen.critic[:, : inputs.OBSERVATION].numpy(), expected, atol=2e-5)
+    term = np.concatenate([*common, body.joint_torque, ee9], axis=1)
+    np.testing.assert_allclose(seen.term.numpy(), term, atol=2e-5)
+    target = sensors.target(truth).pos_b
+    np.testing.assert_allclose(seen.policy[:, 58:61].numpy(), target, atol=2e-5)
+    rot_b = np.swapaxes(truth.base_rot_w, 1, 2) @ episode.target_rot_w.double().numpy()
+    np.testing.assert_allclose(
+        seen.policy[:, 61:67].numpy(), np.concatenate([rot_b[..., 0], rot_b[..., 1]], 1), atol=2e-5
+    )
+    np.testing.assert_allclose(seen.velocity.numpy(), privileged.base_lin_vel_b, atol=2e-5)
+
+
+def test_velocities_are_differences_over_a_period():
+    """The end-effector's velocity columns carry the pose of the step before into the present one."""
+    env = environment()
+    env.begin_rollout(0, 12)
+    for action in actions(11):
+        env.step(action)
+    before = env._state
+    done = env.step(actions(12)[-1]).done
+    alive = (~done).nonzero()[:, 0]
+    rot_w = rotation_from_wxyz(env._state.qpos[:, 3:7])
+    velocity_w = torch.einsum("nij,nj->ni", rot_w, env._view.ee_vel_b[:, :3])
+    moved = before.ee_pos_w + 0.02 * velocity_w
+    torch.testing.assert_close(moved[alive], env._state.ee_pos_w[alive], atol=1e-5, rtol=0)
+    turn = 0.02 * torch.einsum("nij,nj->ni", rot_w, env._view.ee_vel_b[:, 3:])
+    hat = torch.linalg.cross(turn[:, :, None].expand(-1, 3, 3), before.ee_rot_w, dim=1)
+    torch.testing.assert_close((before.ee_rot_w + hat)[alive], env._state.ee_rot_w[alive], atol=0.02, rtol=0)
+
+
+def test_starts_have_the_manifests_distribution():
+    """Ranges of the protocol, filled; the resting height of each leg posture; strata by weight."""
+    count, spread = 600, PROTOCOL.randomization
+    draws = draw_starts(PROTOCOL, POOL, count, stream(5, "test"))
+    start = draws.start
+    for values, low, high in (
+        (start.friction, *spread.friction),
+        (start.base_mass, *spread.base_mass),
+        (start.base_vel[:, :3], -spread.base_lin_vel, spread.base_lin_vel),
+        (start.base_vel[:, 3:], -spread.base_ang_vel, spread.base_ang_vel),
+        (start.leg_q, -spread.leg_q, spread.leg_q),
+        (start.leg_qd, -spread.leg_qd, spread.leg_qd),
+        (start.kp_scale, *spread.gain),
+        (start.kd_scale, *spread.gain),
+        (draws.decay, *DECAY),
+    ):
+        assert low <= values.min() < low + 0.02 * (high - low)
+        assert high >= values.max() > high - 0.02 * (high - low)
+    heights = [randomization.resting_height(PROTOCOL.robot, q) for q in start.leg_q[:5]]
+    np.testing.assert_array_equal(start.base_height[:5], heights)
+    counts = np.bincount(POOL.stratum[draws.target], minlength=3)
+    assert np.all(np.abs(counts - count / 3) < 5 * np.sqrt(count * 2 / 9))
+
+
+def test_pushes_are_the_manifests():
+    """One episode's draw equals the evaluation's from an equal generator."""
+    for seed in range(20):
+        step, velocity = draw_pushes(PROTOCOL, 1, stream(seed, "test"))
+        time, expected = randomization.draw_pushes(
+            PROTOCOL.push, PROTOCOL.episodes.horizon, stream(seed, "test")
+        )
+        np.testing.assert_array_equal(
+            step[0], np.where(np.isnan(time), -1, np.round(np.nan_to_num(time) / 0.02))
+        )
+        np.testing.assert_array_equal(velocity[0].ravel(), expected)
+
+
+def test_a_push_comes_at_its_step():
+    """Only that environment's base jumps, by what was drawn."""
+    protocol = coarse()
+    with_push, without = environment(protocol), environment(protocol)
+    for env in (with_push, without):
+        env._episode.push_step.fill_(-1)
+        env.begin_rollout(0, 1)
+    with_push._episode.push_step[2, 0] = with_push._episode.step[2]
+    with_push._episode.push_vel[2, 0] = torch.tensor([0.4, -0.2])
+    moved = []
+    for env in (with_push, without):
+        env.step(torch.zeros(N, 14))
+        moved.append(env._state.qpos[:, :2].clone())
+    difference = (moved[0] - moved[1]).abs().sum(-1)
+    assert difference[2] > 1e-3
+    assert (difference[[0, 1, 3, 4, 5]] == 0).all()
+
+
+def test_curriculum_ends_at_the_protocols_weights():
+    np.testing.assert_allclose(shares(PROTOCOL, 0.0), FIRST_SHARES)
+    np.testing.assert_allclose(shares(PROTOCOL, 1.0), np.full(3, 1 / 3))
+    for part in (0.0, 0.3, 1.0):
+        assert shares(PROTOCOL, part).sum() == pytest.approx(1.0)
+
+
+def test_noise_is_the_protocols():
+    """Uniform within the half-widths, on the shared columns alone, and the critic's are clean."""
+    half = noise_half_widths(PROTOCOL)
+    assert half.shape == (57,)
+    assert half[0] == PROTOCOL.noise.base_ang_vel and half[20] == PROTOCOL.noise.joint_vel
+    assert half[47] == PROTOCOL.noise.joint_torque and half[-1] == PROTOCOL.noise.ee_rot
+    env = environment(count=64)
+    env.begin_rollout(0, 1)
+    env.step(torch.zeros(64, 14))
+    difference = (env.seen.policy - env.seen.critic[:, :67]).numpy()
+    noisy = np.r_[0:34, 48:57]
+    assert (np.abs(difference[:, noisy]) <= half[np.r_[0:34, 48:57]] + 1e-5).all()
+    assert (np.abs(difference[:, noisy]).max(0) > 0.8 * half[np.r_[0:34, 48:57]]).all()
+    np.testing.assert_array_equal(np.delete(difference, noisy, axis=1), 0)
+
+
+def test_reset_touches_only_what_has_ended():
+    """An environment that ends starts anew; the others go on as in a twin where nothing ends."""
+    protocol = coarse()
+    ends, goes_on = environment(protocol), environment(protocol)
+    ends._episode.step[1] = protocol.num_steps - 1
+    goes_on._episode.step[1] = 0
+    for env in (ends, goes_on):
+        env._episode.step[[0, 2, 3, 4, 5]] = 10
+        env._episode.push_step.fill_(-1)
+        env.begin_rollout(0, 2)
+    first = [env.step(torch.zeros(N, 14)) for env in (ends, goes_on)]
+    assert first[0].done.tolist() == [False, True, False, False, False, False]
+    assert first[0].time_out.tolist() == first[0].done.tolist()
+    assert not first[1].done.any()
+    others = [0, 2, 3, 4, 5]
+    assert ends._episode.step.tolist() == [11, 0, 11, 11, 11, 11]
+    assert (ends._episode.action[1] == 0).all() and (ends._view.ee_vel_b[1] == 0).all()
+    e_p, e_r = ends._view.pos_error[1], ends._view.rot_error[1]
+    assert ends._episode.d_ref[1] == 2 * e_p + e_r
+    second = [env.step(torch.zeros(N, 14)) for env in (ends, goes_on)]
+    for a, b in zip(second[0].seen, second[1].seen, strict=True):
+        torch.testing.assert_close(a[others], b[others], rtol=0, atol=0)
+        assert not torch.equal(a[1], b[1])
+
+
+def test_endings():
+    """Tilt and a low base end an episode unsafely; a diverged one is counted, its sum bounded."""
+    env = environment()
+    env.begin_rollout(0, 2)
+    env._episode.step.fill_(0)
+    tilt = 0.45 * np.pi
+    qpos, qvel = env._backend._state["qpos"], env._backend._state["qvel"]
+    qpos[0, 2:7] = [1.5, np.cos(tilt / 2), 0, np.sin(tilt / 2), 0]  # in the air, falling on its face
+    qpos[1, 2] = 0.2
+    qvel[2, 10] = 1e4
+    env.clear_log()
+    step = env.step(torch.zeros(N, 14))
+    assert step.done.tolist() == [True, True, True, False, False, False]
+    assert not step.time_out.any()
+    assert step.reward.isfinite().all() and (step.reward.abs() <= 5).all() and (step.reward[:3] < -1).all()
+    log = env.log()
+    assert log["episode/count"] == 3 and log["episode/diverged"] == 1
+    assert log["episode/falls"] == pytest.approx(2 / 3)
+    for tensor in env.seen:
+        assert tensor.isfinite().all()
+    assert not env.step(torch.zeros(N, 14)).done.any()  # the reset has cleared the engine's warning
+
+
+def test_success_is_the_last_second_inside():
+    """Held for 50 steps at the time-out counts, for 49 not."""
+    env = environment()
+    env.begin_rollout(0, 1)
+    env._episode.step.fill_(0)
+    env._episode.step[:2] = env.protocol.num_steps - 1
+    env._episode.push_step.fill_(-1)
+    window = env.protocol.window_steps
+    env._episode.inside[:2] = torch.tensor([window - 1, window - 2])
+    env._episode.target_pos_w[:2] = env._state.ee_pos_w[:2]
+    env._episode.target_rot_w[:2] = env._state.ee_rot_w[:2]
+    env.clear_log()
+    env.step(torch.zeros(N, 14))
+    assert env.log()["episode/success"] == 0.5
+
+
+def test_threads_do_not_change_anything():
+    one, two = environment(threads=1), environment(threads=2)
+    for env in (one, two):
+        env.begin_rollout(0, 5)
+        for action in actions(5):
+            env.step(action)
+    for a, b in zip(one.seen, two.seen, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_save_and_load_go_on_bit_by_bit():
+    unbroken, broken = environment(), environment()
+    for env in (unbroken, broken):
+        env._episode.step[0] = env.protocol.num_steps - 12  # one reset before, one after
+        env.begin_rollout(0, 8)
+        for action in actions(8):
+            env.step(action)
+    resumed = environment(seed=0)
+    resumed.load(broken.save())
+    for env in (unbroken, resumed):
+        env.begin_rollout(1, 8)
+    for action in actions(8, scale=0.5):
+        a, b = unbroken.step(action), resumed.step(action)
+        assert torch.equal(a.reward, b.reward) and torch.equal(a.done, b.done)
+        for x, y in zip(a.seen, b.seen, strict=True):
+            assert torch.equal(x, y)
+
+
+def test_the_pool_is_feasible_and_its_own():
+    """What ships is equal parts, poses of unit quaternions, and shares no target with the evaluation."""
+    assert np.bincount(POOL.stratum).tolist() == [len(POOL) // 3] * 3
+    np.testing.assert_allclose(np.linalg.norm(POOL.quat_w, axis=1), 1, atol=1e-6)
+    drawn = draw_pool(PROTOCOL, 2)
+    np.testing.assert_array_equal(drawn.pos_w, POOL.pos_w[:2])
+    from wbc_bench.manifest import manifest_path, read_manifest
+
+    frozen, _ = read_manifest(
+        *(lambda found: (found[0], manifest_path(found[1])))(find_protocol("ablation_v1"))
+    )
+    theirs = {hashlib.sha256(row.tobytes()).digest() for row in frozen.target_pos_w.astype(np.float32)}
+    assert not any(hashlib.sha256(row.tobytes()).digest() in theirs for row in POOL.pos_w)
+
+
+def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
+    pool = TargetPool(POOL.stratum[:5], POOL.pos_w[:5], POOL.quat_w[:5])
+    path = tmp_path / "pool.parquet"
+    write_pool(pool, PROTOCOL, path)
+    for mine, theirs in zip(read_pool(PROTOCOL, path), pool, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    narrow = msgspec.structs.replace(
+        PROTOCOL, targets=msgspec.structs.replace(PROTOCOL.targets, x=(0.0, 0.1))
+    )
+    assert digest(narrow) != digest(PROTOCOL) == digest(coarse())
+    with pytest.raises(ManifestError, match="draw it again"):
+        read_pool(narrow, path)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ManifestError, match="not readable"):
+        read_pool(PROTOCOL, path)
+    with pytest.raises(ManifestError, match="wbc-train targets"):
+        read_pool(PROTOCOL, tmp_path / "none.parquet")
+    assert POOLS.exists() and len(STRATA) == 3

@@ -1,0 +1,379 @@
+"""Training: gradients stay apart, sequences stay whole, a resumed run is bit-equal, files survive a kill."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("rsl_rl")
+
+from tensordict import TensorDict  # noqa: E402
+from test_learned_environment import POOL, manifest_of  # noqa: E402
+
+from wbc_baselines.learned import checkpoint, runs  # noqa: E402
+from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
+from wbc_baselines.learned.campaign import campaign, is_done, runs_of, standing  # noqa: E402
+from wbc_baselines.learned.cli import main  # noqa: E402
+from wbc_baselines.learned.curves import smooth, write_curves  # noqa: E402
+from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment  # noqa: E402
+from wbc_baselines.learned.estimators.latent import LatentEstimator  # noqa: E402
+from wbc_baselines.learned.inputs import History  # noqa: E402
+from wbc_baselines.learned.methods import METHODS  # noqa: E402
+from wbc_baselines.learned.runs import RunFolder, run  # noqa: E402
+from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
+from wbc_baselines.learned.starts import draw_starts  # noqa: E402
+from wbc_baselines.learned.training import Trainer, make_environment  # noqa: E402
+from wbc_bench.controller import load_controller  # noqa: E402
+from wbc_bench.errors import UnknownNameError  # noqa: E402
+from wbc_bench.protocol import Noise, Push, find_protocol  # noqa: E402
+from wbc_bench.randomness import stream  # noqa: E402
+from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_bench.rollout import evaluate  # noqa: E402
+
+TINY = Settings(
+    "no_latent",
+    budget=4 * 8 * 6,
+    envs=8,
+    steps=6,
+    minibatches=2,
+    threads=1,
+    estimator_share=0.5,
+    estimator_minibatches=2,
+)
+
+
+def trainer(**changes) -> Trainer:
+    settings = replace(TINY, **changes)
+    return Trainer(settings, make_environment(settings))
+
+
+def assert_equal(a, b, where: str = "") -> None:
+    """Nested states are equal bit by bit."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_equal(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{where}[{k}]")
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b), where
+    else:
+        assert a == b, where
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_two_and_two_iterations_are_four(method, tmp_path):
+    """Every method, through the resume file: networks, optimisers, normalisers, physics and draws."""
+    unbroken, broken = trainer(method=method), trainer(method=method)
+    for _ in range(2):
+        broken.iterate()
+    folder = RunFolder(tmp_path / broken.settings.name)
+    folder.open(broken.settings)
+    runs.save_resume(broken, folder, 1.0)
+    resumed = trainer(method=method)
+    assert runs.load_resume(resumed, folder) == 1.0
+    last = [unbroken.iterate() for _ in range(4)][-1]
+    again = [resumed.iterate() for _ in range(2)][-1]
+    assert_equal(unbroken.save(), resumed.save())
+    for name, value in last.items():
+        if not name.startswith("time/"):
+            np.testing.assert_equal(again[name], value, err_msg=name)
+
+
+def test_equal_seeds_are_equal_and_others_are_not():
+    one, same, other = trainer(seed=1), trainer(seed=1), trainer(seed=2)
+    for each in (one, same, other):
+        each.iterate()
+    assert_equal(dict(one.actor().state_dict()), dict(same.actor().state_dict()))
+    assert not torch.equal(one.actor().mlp[0].weight, other.actor().mlp[0].weight)
+
+
+def test_the_policys_gradient_never_reaches_the_estimator():
+    """PPO's update leaves the estimator without gradient, weights as they were; and the other way round."""
+    t = trainer(method="transformer_gru")
+    weights = {name: value.clone() for name, value in t.estimator.state_dict().items()}
+    t.environment.begin_rollout(0, TINY.steps)
+    rollout = t._roll_out()
+    assert rollout
+    assert not t.ppo.storage.observations["context"].requires_grad
+    with torch.no_grad():
+        t.ppo.compute_returns(t._observations())
+    t.ppo.update()
+    assert all(p.grad is None for p in t.estimator.parameters())
+    assert_equal(weights, dict(t.estimator.state_dict()))
+    mine = {id(p) for p in t.estimator.parameters()}
+    assert not mine & {id(p) for group in t.ppo.optimizer.param_groups for p in group["params"]}
+    policy = {name: value.clone() for name, value in t.ppo.actor.state_dict().items()}
+    t._update_estimator(rollout)
+    assert_equal(policy, dict(t.ppo.actor.state_dict()))
+    assert any(not torch.equal(weights[name], value) for name, value in t.estimator.state_dict().items())
+
+
+@pytest.mark.parametrize("method", ["cenet", "gru", "transformer_gru"])
+def test_the_rollout_gives_the_contexts_back(method, monkeypatch):
+    """Unrolled from stored state and resets, the windows yield the contexts the actor saw."""
+    monkeypatch.setattr(torch, "randn", lambda *size, device=None: torch.zeros(*size))
+    t = trainer(method=method)
+    t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor(
+        [2, 3, 4, 5, 8, 9, 10, 11]
+    )
+    contexts, estimate = [], t._estimate
+
+    def estimated():
+        contexts.append(t._context)  # the one that the step before has used
+        return estimate()
+
+    monkeypatch.setattr(t, "_estimate", estimated)
+    for _ in range(2):  # the second rollout begins in the middle of episodes
+        contexts.clear()
+        t.environment.begin_rollout(t.iteration, TINY.steps)
+        rollout = t._roll_out()
+        assert rollout and isinstance(t.estimator, LatentEstimator)
+        t.iteration += 1
+        t.ppo.storage.clear()
+        seen = torch.stack(contexts)[:, rollout.ids]
+        (batch,) = rollout.batches(1)
+        e = t.estimator.encode(batch)
+        torch.testing.assert_close(e[..., : seen.shape[-1]], seen, atol=1e-5, rtol=1e-5)
+        assert batch.start.any() and not batch.valid.all()
+
+
+def test_the_next_observation_is_of_the_next_step():
+    """Where valid, what step t's decoder is to predict is what step t + 1 begins with."""
+    t = trainer(method="cenet")
+    t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor([2, 4, *[100] * 6])
+    t.environment.begin_rollout(0, TINY.steps)
+    rollout = t._roll_out()
+    assert rollout
+    (batch,) = rollout.batches(1)
+    # columns shared by the noisy term and the clean observation, up to the noise
+    newest = batch.history[1:, :, -1, 6:20]
+    assert ((newest - batch.next_observation[:-1, :, 6:20]).abs() <= 0.01 + 1e-6).all()
+    assert torch.equal(batch.start[1:], ~batch.valid[:-1])
+
+
+def test_the_learning_rate_has_a_floor():
+    t = trainer(desired_kl=1e-9, least_learning_rate=2e-4)
+    t.iterate()
+    assert t.ppo.learning_rate >= 2e-4
+    assert t.ppo.optimizer.param_groups[0]["lr"] >= 2e-4
+
+
+def test_time_outs_are_bootstrapped():
+    """A time-out's reward grows by gamma V(s), a fall's does not."""
+    t = trainer()
+    env = t.environment
+    env._episode.step[:] = 0
+    env._episode.step[0] = env.protocol.num_steps - 1
+    env._backend._state["qpos"][1, 2] = 0.2
+    env.begin_rollout(0, 1)
+    observations = t._observations()
+    step = env.step(t.ppo.act(observations))
+    assert t.ppo.transition.values is not None
+    values = t.ppo.transition.values[:, 0].clone()
+    t.ppo.process_env_step(t._observations(), step.reward, step.done, {"time_outs": step.time_out})
+    stored = t.ppo.storage.rewards[0, :, 0]
+    assert step.time_out[0] and step.done[1] and not step.time_out[1]
+    torch.testing.assert_close(stored[0], step.reward[0] + TINY.gamma * values[0])
+    torch.testing.assert_close(stored[1:], step.reward[1:])
+
+
+def test_entropy_and_curriculum_follow_the_budget():
+    t = trainer(curriculum=0.5)
+    bonus, ramp = [], []
+    while not t.done:
+        bonus.append(t.iterate()["policy/entropy_bonus"])
+        ramp.append(t.environment.curriculum)
+    np.testing.assert_allclose(bonus, 0.01 + np.arange(4) / 4 * (0.0005 - 0.01))
+    np.testing.assert_allclose(ramp, [0, 0.5, 1, 1])
+
+
+@pytest.mark.parametrize("method", ["no_latent", "cenet", "transformer_gru", "oracle"])
+def test_the_evaluation_takes_the_same_actions(method, tmp_path):
+    """Without noise, the checkpoint in the bench commands what the trained networks command in training."""
+    t = trainer(method=method)
+    for _ in range(2):
+        t.iterate()
+    path = tmp_path / "trained.safetensors"
+    t.write_checkpoint(path, 1.0)
+
+    protocol, _ = find_protocol("ablation_v1")
+    episodes = msgspec.structs.replace(protocol.episodes, horizon=1.0)
+    protocol = msgspec.structs.replace(protocol, noise=Noise(), push=Push(), episodes=episodes)
+    env = Environment(protocol, CpuBackend(protocol, 4, 1), POOL, "gated", 7)
+    target = draw_starts(protocol, POOL, 4, stream(7, "training start", 0)).target  # what it has drawn
+    start = draw_starts(protocol, POOL, 4, stream(7, "training start", 0)).start
+    episode = env._episode
+    episode.d_ref[:] = 2 * env._view.pos_error + env._view.rot_error
+    episode.step[:], episode.decay[:] = 0, protocol.reference_decay
+
+    env.seen = env._see()  # of a new episode
+    history, state = History(env.seen.term), torch.zeros(4, t.estimator.state_dim)
+    env.begin_rollout(0, 25)
+    expected = []
+    with torch.no_grad():
+        for _ in range(25):
+            context = env.seen.critic[:, PRIVILEGED_COLUMNS]
+            if method != "oracle":
+                context, state = t.estimator.step(history.window, state)
+            groups = {"policy": env.seen.policy, "context": context}
+            action = t.ppo.actor(TensorDict(groups, batch_size=[4]))
+            expected.append(action)
+            env.step(action)
+            history.push(env.seen.term)
+
+    controller = load_controller(f"learned:{path}", load_robot(protocol.robot))
+    found = evaluate(controller, protocol, manifest_of(start, target))
+    lasted = min(25, int(found.steps.min()))
+    assert lasted > 10
+    np.testing.assert_allclose(
+        found.action[:, :lasted], torch.stack(expected, 1)[:, :lasted].numpy(), atol=2e-4, rtol=0
+    )
+
+
+# ---- files -----------------------------------------------------------------------------------------------
+
+
+def test_a_run_leaves_metrics_and_goes_on(tmp_path):
+    """Every reward term is logged; a longer budget goes on; other settings are refused by name."""
+    folder = RunFolder(tmp_path / TINY.name)
+    constant = replace(TINY, entropy=(0.01, 0.01))  # the schedule knows the budget
+    run(replace(constant, budget=2 * 48), folder, tensorboard=False)
+    assert is_done(folder, replace(constant, budget=96)) and not is_done(folder, constant)
+    with folder.metrics.open("a") as file:
+        file.write('{"iteration": 3, "samp')  # as a kill would leave it
+    run(constant, folder)
+    rows = folder.read_metrics()
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
+    assert [row["samples"] for row in rows] == [48, 96, 144, 192]
+    from wbc_baselines.learned.rewards import SCALES
+
+    assert {f"reward/{name}" for name in SCALES} <= rows[0].keys()
+    assert any((folder.path / "tensorboard").iterdir())
+    assert not folder.claim.exists()
+    unbroken = trainer(entropy=constant.entropy)
+    while not unbroken.done:
+        unbroken.iterate()
+    resumed = trainer()
+    runs.load_resume(resumed, folder)
+    assert_equal(unbroken.save(), resumed.save())
+    assert checkpoint.load(folder.checkpoint).card.samples == 192
+    with pytest.raises(TrainingError, match=r"gamma 0\.99 -> 0\.9"):
+        run(replace(constant, gamma=0.9), folder)
+
+
+def test_a_killed_run_resumes(tmp_path):
+    """SIGKILL at any moment leaves a folder that the same command finishes."""
+    code = (
+        "import sys; from pathlib import Path; from wbc_baselines.learned import runs;"
+        "from wbc_baselines.learned.settings import Settings; runs.CHECKPOINT_PERIOD = 0.0;"
+        "runs.run(Settings('no_latent', budget=1e9, envs=8, steps=6, minibatches=2, threads=1,"
+        "estimator_share=0.5, estimator_minibatches=2), runs.RunFolder(Path(sys.argv[1])), tensorboard=False)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"OMP_NUM_THREADS": "1"}
+    )
+    folder = RunFolder(tmp_path)
+    deadline = time.monotonic() + 60
+    while len(folder.read_metrics()) < 3 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    done = len(folder.read_metrics())
+    assert done >= 3 and folder.claim.exists()
+    settings = replace(TINY, budget=48 * (done + 2))
+    run(settings, folder, tensorboard=False)
+    assert [row["iteration"] for row in folder.read_metrics()] == list(range(1, done + 3))
+
+
+def test_claims(tmp_path):
+    """One process at a time; a dead process's claim and a stale one are taken over."""
+    one, two = RunFolder(tmp_path), RunFolder(tmp_path)
+    assert one.take() and not two.take()
+    one.release()
+    assert two.take()
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    one.claim.write_text(one.claim.read_text().split()[0] + f" {dead.pid}")
+    assert one.take()
+    one.claim.write_text("elsewhere 1")
+    assert not two.take()
+    os.utime(one.claim, (0, 0))
+    assert two.take()
+
+
+def test_a_damaged_resume_file_is_one_line(tmp_path):
+    t, folder = trainer(), RunFolder(tmp_path / TINY.name)
+    folder.open(TINY)
+    runs.save_resume(t, folder, 0.0)
+    folder.resume.write_bytes(folder.resume.read_bytes()[:1000])
+    with pytest.raises(TrainingError, match="cannot be read"):
+        runs.load_resume(t, folder)
+
+
+def test_campaign_trains_what_is_missing(tmp_path):
+    """Every method and seed once; what is done or claimed elsewhere is left alone."""
+    chosen = runs_of(replace(TINY, budget=48), ["no_latent", "oracle"], 2)
+    assert [one.name for one in chosen] == ["no_latent@0", "oracle@0", "no_latent@1", "oracle@1"]
+    elsewhere = RunFolder(tmp_path / "oracle@0")
+    assert elsewhere.take()
+    names = [one.name for one in campaign(chosen, tmp_path, lambda *_: None)]
+    assert names == ["no_latent@0", "no_latent@1", "oracle@1"]
+    elsewhere.release()
+    assert [one.name for one in campaign(chosen, tmp_path, lambda *_: None)] == ["oracle@0"]
+    found = standing(tmp_path)
+    assert [(s.name, s.state, s.samples) for s in found] == [
+        (name, "done", 48) for name in ("no_latent@0", "no_latent@1", "oracle@0", "oracle@1")
+    ]
+    figures = write_curves(tmp_path, tmp_path / "figures")
+    assert {path.suffix for path in figures} == {".png", ".svg"}
+    assert figures[0].read_bytes()[:4] == b"\x89PNG"
+
+
+def test_smoothing_weighs_by_episodes():
+    """A moving mean over 3 % of the samples: neighbours far apart stay apart, equal samples pool."""
+    rows = [
+        {"samples": s, "x": x, "episode/count": n} for s, x, n in ((1, 0.0, 1), (100, 1.0, 3), (101, 0.0, 1))
+    ]
+    samples, values = smooth(rows, "x")
+    np.testing.assert_allclose(samples, [1, 100, 101])
+    np.testing.assert_allclose(values, [0, 0.75, 0.75])
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"envs": 0}, "--envs 0"), ({"minibatches": 49}, "1 to 48"), ({"estimator_minibatches": 5}, "1 to 4")],
+)
+def test_impossible_settings_are_refused(changes, words):
+    with pytest.raises(TrainingError, match=words):
+        replace(TINY, **changes).check()
+
+
+def test_mistakes_name_the_valid_values():
+    with pytest.raises(UnknownNameError, match="no_latent"):
+        replace(TINY, method="no_latnt").check()
+    with pytest.raises(TrainingError, match=r"0\.02 s"):
+        make_environment(replace(TINY, timestep=0.01, decimation=3))
+
+
+def test_the_command_line(tmp_path, capsys):
+    """`wbc-train run` with a budget like 6e7, then `status`; a mistake is one line and code 2."""
+    options = ["--budget", "4.8e1", "--envs", "8", "--steps", "6", "--minibatches", "2", "--threads", "1"]
+    options += ["--estimator-share", "0.5", "--out", str(tmp_path)]
+    main(["run", "--method", "no_latent", *options])
+    main(["status", "--out", str(tmp_path)])
+    told = capsys.readouterr().out
+    assert "no_latent@0" in told and "done" in told
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", "--method", "oracel", *options])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and "oracle" in error and error.count("\n") == 1

@@ -1,0 +1,48 @@
+"""The two back ends of training agree; skipped where mujoco_warp is not installed."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("mujoco_warp")
+
+from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
+from wbc_baselines.learned.backends.warp import WarpBackend  # noqa: E402
+from wbc_baselines.learned.pool import read_pool  # noqa: E402
+from wbc_baselines.learned.starts import draw_starts  # noqa: E402
+from wbc_bench.protocol import find_protocol  # noqa: E402
+from wbc_bench.randomness import stream  # noqa: E402
+from wbc_bench.robot import load_robot  # noqa: E402
+
+PROTOCOL = find_protocol("ablation_v1")[0]
+
+
+def test_the_back_ends_agree_over_a_third_of_a_second():
+    """Two robots with their own mass, friction and gains, onto the ground, 15 steps of 2 ms x 10."""
+    draws = draw_starts(PROTOCOL, read_pool(PROTOCOL), 2, stream(4, "test"))
+    start = draws.start._replace(leg_q=0.2 * draws.start.leg_q)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    cpu, warp = CpuBackend(PROTOCOL, 2, 1), WarpBackend(PROTOCOL, 2, device)
+    first = [backend.reset(np.arange(2), start) for backend in (cpu, warp)]
+    np.testing.assert_allclose(first[0].torque, first[1].torque.cpu(), atol=1e-4)
+    robot = load_robot(PROTOCOL.robot)
+    default, scale = (torch.tensor(a, dtype=torch.float32) for a in (robot.default_q, robot.action_scale))
+    generator = torch.Generator().manual_seed(0)
+    a, b = first
+    for _ in range(15):
+        command = default + 0.1 * scale * torch.randn(2, 14, generator=generator)
+        a, b = cpu.step(command), warp.step(command.to(device))
+    for name, tolerance in (
+        ("qpos", 2e-5),
+        ("qvel", 2e-3),
+        ("torque", 2e-2),
+        ("ee_pos_w", 2e-5),
+        ("ee_rot_w", 2e-5),
+        ("feet_pos_w", 2e-5),
+        ("feet_up_w", 2e-5),
+        ("foot_force_w", 0.5),
+        ("ground_contact", 0),
+    ):
+        mine, theirs = getattr(a, name), getattr(b, name).cpu()
+        np.testing.assert_allclose(mine, theirs, atol=tolerance, rtol=0, err_msg=name)
+    assert (a.foot_force_w[..., 2].abs().sum(-1) > 50).all()  # on the ground
