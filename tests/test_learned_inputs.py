@@ -33,13 +33,13 @@ def test_dimensions_are_the_paper_s():
 
 def test_terms_stand_where_the_layout_says():
     *head, pos, rot, d_ref = numbered(inputs.OBSERVATION_LAYOUT)
-    found = inputs.observation(*head[:5], ee(pos, rot), d_ref[:, 0])
+    found = inputs.observation(*head[:5], ee(pos, rot), d_ref[:, 0])  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(found, expected(inputs.OBSERVATION_LAYOUT).expand(N, -1))
     *head, pos, rot = numbered(inputs.HISTORY_LAYOUT)
-    found = inputs.history_term(*head[:5], ee(pos, rot))
+    found = inputs.history_term(*head[:5], ee(pos, rot))  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(found, expected(inputs.HISTORY_LAYOUT).expand(N, -1))
     *head, pos, rot, feet = numbered(inputs.NEXT_OBSERVATION_LAYOUT)
-    found = inputs.next_observation(*head[:4], ee(pos, rot), feet)
+    found = inputs.next_observation(*head[:4], ee(pos, rot), feet)  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(found, expected(inputs.NEXT_OBSERVATION_LAYOUT).expand(N, -1))
     parts = [part[:, 0] if part.shape[1] == 1 else part for part in numbered(inputs.PRIVILEGED_LAYOUT)]
     found = inputs.privileged(*parts)
