@@ -116,6 +116,7 @@ def test_observations_are_the_evaluations():
         joint_torque=state.torque.double().numpy(),
         ee_pos_w=state.ee_pos_w.double().numpy(),
         ee_rot_w=state.ee_rot_w.double().numpy(),
+        foot_pos_w=state.feet_pos_w.double().numpy(),
         foot_force_w=state.foot_force_w.double().numpy(),
         ground_contact=state.ground_contact.numpy(),
         diverged=state.diverged.numpy(),
