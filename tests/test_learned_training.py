@@ -21,7 +21,7 @@ from wbc_baselines.learned import checkpoint, runs  # noqa: E402
 from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.campaign import campaign, is_done, runs_of, standing  # noqa: E402
 from wbc_baselines.learned.cli import main  # noqa: E402
-from wbc_baselines.learned.curves import smooth, write_curves  # noqa: E402
+from wbc_baselines.learned.curves import measured_scores, smooth, write_curves  # noqa: E402
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment  # noqa: E402
 from wbc_baselines.learned.estimators.latent import LatentEstimator  # noqa: E402
 from wbc_baselines.learned.inputs import History  # noqa: E402
@@ -347,6 +347,16 @@ def test_smoothing_weighs_by_episodes():
     samples, values = smooth(rows, "x")
     np.testing.assert_allclose(samples, [1, 100, 101])
     np.testing.assert_allclose(values, [0, 0.75, 0.75])
+
+
+def test_the_scores_are_means_where_their_gate_is_open():
+    """Of g = 0.25, (1 - g) s_m = 0.9 and g s_l = 0.3 on average: 1.2 and 1.2."""
+    early = {"gate/phase": 1.0, "gate/manipulation": 0.0, "gate/reference": 9.0}
+    late = [
+        {"gate/phase": phase, "gate/manipulation": m, "gate/reference": ref}
+        for phase, m, ref in ((0.2, 1.0, 0.2), (0.3, 0.8, 0.4))
+    ]
+    np.testing.assert_allclose(measured_scores([*[early] * 18, *late]), (0.25, 1.2, 1.2))
 
 
 @pytest.mark.parametrize(

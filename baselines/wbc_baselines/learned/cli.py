@@ -113,6 +113,23 @@ class Curves:
 
 
 @dataclass(frozen=True)
+class Gates:
+    """Print the mean gates of trained runs: the constants that the additive reward puts in their place."""
+
+    out: Path = RUNS
+    """Folder of runs."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.curves import measured_scores
+        from wbc_baselines.learned.runs import RunFolder
+
+        for path in sorted(self.out.glob("*@*/metrics.jsonl")):
+            if rows := RunFolder(path.parent).read_metrics():
+                phase, score_m, score_l = measured_scores(rows)
+                print(f"{path.parent.name}: PHASE {phase:.4f}, SCORE_M {score_m:.3f}, SCORE_L {score_l:.3f}")
+
+
+@dataclass(frozen=True)
 class Targets:
     """Draw the pool of feasible targets that training picks from (12,000: five minutes on two cores)."""
 
@@ -145,6 +162,7 @@ Command = (
     | Annotated[Campaign, subcommand("campaign")]
     | Annotated[Status, subcommand("status")]
     | Annotated[Curves, subcommand("curves")]
+    | Annotated[Gates, subcommand("gates")]
     | Annotated[Targets, subcommand("targets")]
 )
 

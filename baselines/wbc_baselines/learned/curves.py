@@ -55,6 +55,17 @@ def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, f
     return ax
 
 
+def measured_scores(rows: Rows, part: float = 0.1) -> tuple[float, float, float]:
+    """PHASE, SCORE_M and SCORE_L of `rewards`, measured over the last `part` of a run's iterations."""
+    last = rows[-max(1, round(part * len(rows))) :]
+
+    def mean(gate: str) -> float:
+        return float(np.mean([row[f"gate/{gate}"] for row in last]))
+
+    phase = mean("phase")
+    return phase, mean("manipulation") / (1 - phase), mean("reference") / phase
+
+
 def write_curves(out: Path, figures: Path, name: str = "learning_curves") -> list[Path]:
     """Draw every run below `out` into `figures`, PNG and SVG; nothing if there is no run."""
     order = list(METHODS)

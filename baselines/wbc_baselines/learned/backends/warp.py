@@ -44,7 +44,7 @@ class WarpBackend:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         with wp.ScopedDevice(self._device):
-            sizes = dict.fromkeys((*_MODEL, *_DERIVED), num_envs)
+            sizes: dict[str, int] = dict.fromkeys((*_MODEL, *_DERIVED), num_envs)
             self._m: Any = mjw.put_model(model, batch_sizes=sizes)
             self._m.opt.warn_overflow = 0  # read at every step instead
             self._d: Any = mjw.put_data(model, data, nworld=num_envs, nconmax=CONTACTS, njmax=ROWS)
