@@ -52,6 +52,7 @@ def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, f
             label=METHODS[method].label if first else None,
         )
     ax.set(xlabel="Control steps (million)", ylabel=label)
+    ax.set_ylim(bottom=0, top=102 if label.endswith("(%)") else None)
     return ax
 
 
