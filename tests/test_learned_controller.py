@@ -1,6 +1,7 @@
 """The learned controller: what it reads, what it remembers, and one training seed a replicate."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,7 +170,7 @@ def test_rows_do_not_see_each_other(stream, method):
     alone, together = make(method), make(method)
     chosen = np.array([1, 3])
 
-    def take(value):
+    def take(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             return value[chosen]
         return type(value)(*map(take, value)) if isinstance(value, tuple) else value
@@ -186,7 +187,7 @@ def test_rows_do_not_see_each_other(stream, method):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
-def _copied(signal):
+def _copied(signal: Any) -> Any:
     return signal and type(signal)(*map(np.copy, signal))
 
 

@@ -21,6 +21,10 @@ def expected(layout: inputs.Layout) -> torch.Tensor:
     return torch.cat([torch.full((term.size,), float(k)) for k, term in enumerate(layout)])
 
 
+def ee(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
+    return torch.cat([pos, rot], -1)
+
+
 def test_dimensions_are_the_paper_s():
     widths = (inputs.OBSERVATION, inputs.COMMAND, inputs.HISTORY, inputs.HISTORY_TERM, inputs.CONTEXT_MAX)
     assert widths == (58, 9, 10, 57, 67)
@@ -28,14 +32,14 @@ def test_dimensions_are_the_paper_s():
 
 
 def test_terms_stand_where_the_layout_says():
-    *head, pos, rot, d_ref = numbered(inputs.OBSERVATION_LAYOUT)
-    found = inputs.observation(*head, torch.cat([pos, rot], -1), d_ref[:, 0])
+    w, g, q, qd, action, pos, rot, d_ref = numbered(inputs.OBSERVATION_LAYOUT)
+    found = inputs.observation(w, g, q, qd, action, ee(pos, rot), d_ref[:, 0])
     torch.testing.assert_close(found, expected(inputs.OBSERVATION_LAYOUT).expand(N, -1))
-    *head, pos, rot = numbered(inputs.HISTORY_LAYOUT)
-    found = inputs.history_term(*head, torch.cat([pos, rot], -1))
+    w, g, q, qd, torque, pos, rot = numbered(inputs.HISTORY_LAYOUT)
+    found = inputs.history_term(w, g, q, qd, torque, ee(pos, rot))
     torch.testing.assert_close(found, expected(inputs.HISTORY_LAYOUT).expand(N, -1))
-    *head, pos, rot, feet = numbered(inputs.NEXT_OBSERVATION_LAYOUT)
-    found = inputs.next_observation(*head, torch.cat([pos, rot], -1), feet)
+    w, g, q, qd, pos, rot, feet = numbered(inputs.NEXT_OBSERVATION_LAYOUT)
+    found = inputs.next_observation(w, g, q, qd, ee(pos, rot), feet)
     torch.testing.assert_close(found, expected(inputs.NEXT_OBSERVATION_LAYOUT).expand(N, -1))
     parts = [part[:, 0] if part.shape[1] == 1 else part for part in numbered(inputs.PRIVILEGED_LAYOUT)]
     found = inputs.privileged(*parts)
