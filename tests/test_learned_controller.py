@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 import torch
@@ -131,6 +132,14 @@ def test_reference_starts_at_the_observed_error_and_decays(stream):
     assert (d_ref[-1] == 0).any()
 
 
+def test_the_protocol_sets_the_decay(smoke: EvalProtocol, calm_rows: CalmRows):
+    slower = msgspec.structs.replace(smoke, reference_decay=0.5)
+    engine = Recording("no_latent")
+    evaluate(make("no_latent", engine), slower, calm_rows(2))
+    first, second = (values["observation"][:, 57] for values in engine.seen[:2])
+    torch.testing.assert_close(first - second, torch.full((2,), 0.01), atol=1e-5, rtol=0)
+
+
 def test_the_oracle_is_given_the_truth(stream):
     engine = Recording("oracle")
     drive(make("oracle", engine), stream, 6)
@@ -201,8 +210,6 @@ def test_command_is_default_plus_scaled_action(stream):
 
 
 def test_another_period_is_refused(smoke: EvalProtocol, calm_rows: CalmRows):
-    import msgspec
-
     slower = msgspec.structs.replace(smoke, physics=msgspec.structs.replace(smoke.physics, decimation=20))
     with pytest.raises(BenchError, match=r"every 0\.02 s"):
         evaluate(make("no_latent"), slower, calm_rows(2))

@@ -32,14 +32,14 @@ def test_dimensions_are_the_paper_s():
 
 
 def test_terms_stand_where_the_layout_says():
-    *head, pos, rot, d_ref = numbered(inputs.OBSERVATION_LAYOUT)
-    found = inputs.observation(*head[:5], ee(pos, rot), d_ref[:, 0])  # pyright: ignore[reportCallIssue]
+    w, g, q, qd, action, pos, rot, d_ref = numbered(inputs.OBSERVATION_LAYOUT)
+    found = inputs.observation(w, g, q, qd, action, ee(pos, rot), d_ref[:, 0])
     torch.testing.assert_close(found, expected(inputs.OBSERVATION_LAYOUT).expand(N, -1))
-    *head, pos, rot = numbered(inputs.HISTORY_LAYOUT)
-    found = inputs.history_term(*head[:5], ee(pos, rot))  # pyright: ignore[reportCallIssue]
+    w, g, q, qd, torque, pos, rot = numbered(inputs.HISTORY_LAYOUT)
+    found = inputs.history_term(w, g, q, qd, torque, ee(pos, rot))
     torch.testing.assert_close(found, expected(inputs.HISTORY_LAYOUT).expand(N, -1))
-    *head, pos, rot, feet = numbered(inputs.NEXT_OBSERVATION_LAYOUT)
-    found = inputs.next_observation(*head[:4], ee(pos, rot), feet)  # pyright: ignore[reportCallIssue]
+    w, g, q, qd, pos, rot, feet = numbered(inputs.NEXT_OBSERVATION_LAYOUT)
+    found = inputs.next_observation(w, g, q, qd, ee(pos, rot), feet)
     torch.testing.assert_close(found, expected(inputs.NEXT_OBSERVATION_LAYOUT).expand(N, -1))
     parts = [part[:, 0] if part.shape[1] == 1 else part for part in numbered(inputs.PRIVILEGED_LAYOUT)]
     found = inputs.privileged(*parts)

@@ -10,7 +10,7 @@ from wbc_bench.controller import SIGNALS, Observation, Signal
 from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.observation import Sensors
 from wbc_bench.protocol import EvalProtocol
-from wbc_bench.rotations import geodesic_angle, matrix_from_rpy, matrix_from_wxyz, rho6
+from wbc_bench.rotations import geodesic_angle, matrix_from_rotvec, matrix_from_rpy, matrix_from_wxyz, rho6
 from wbc_bench.simulation import State
 
 COUNT = 4
@@ -187,3 +187,29 @@ def test_active_is_a_copy(smoke: EvalProtocol, rows: EpisodeManifest) -> None:
     obs = Sensors(smoke, rows, frozenset()).observe(0, 0.0, random_state(), active)
     active[:] = False
     assert obs.active.all()
+
+
+def test_privileged_rates_are_those_of_the_motion(smoke: EvalProtocol, rows: EpisodeManifest) -> None:
+    """A known twist of the end-effector and known accelerations over one period; zero at the start."""
+    period, before = smoke.control_period, random_state()
+    rng = np.random.default_rng(5)
+    lin_w, ang_w, acc = rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 3)), rng.normal(size=(COUNT, 14))
+    after = random_state(1)._replace(
+        ee_pos_w=before.ee_pos_w + lin_w * period,
+        ee_rot_w=matrix_from_rotvec(ang_w * period) @ before.ee_rot_w,
+        joint_vel=before.joint_vel + acc * period,
+    )
+    sensors, active = Sensors(smoke, rows, ALL), np.ones(COUNT, dtype=bool)
+    first = sensors.observe(0, 0.0, before, active).privileged
+    second = sensors.observe(1, period, after, active).privileged
+    assert first is not None and second is not None
+    for still in (first.joint_acc, first.ee_lin_vel_b, first.ee_ang_vel_b):
+        assert not still.any()
+    np.testing.assert_allclose(second.joint_acc, acc)
+    for row, rot_w in enumerate(after.base_rot_w):
+        np.testing.assert_allclose(rot_w @ second.ee_lin_vel_b[row], lin_w[row])
+        np.testing.assert_allclose(rot_w @ second.ee_ang_vel_b[row], ang_w[row], rtol=1e-3)
+        for foot in range(2):
+            world = after.base_pos_w[row] + rot_w @ second.foot_pos_b[row, foot]
+            np.testing.assert_allclose(world, after.foot_pos_w[row, foot])
+    np.testing.assert_array_equal(second.joint_torque, after.joint_torque)

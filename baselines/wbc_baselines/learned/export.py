@@ -5,6 +5,7 @@ The checkpoint's card travels in the file, so that `onnx:FILE` is checked agains
 
 import hashlib
 import tempfile
+import warnings
 from pathlib import Path
 
 import msgspec
@@ -43,7 +44,9 @@ class _Positional(nn.Module):
 def write_onnx(path: Path, policy: Policy, card: Card) -> None:
     """Write a policy and its card; the batch is free."""
     flow = policy.flow
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        # of torch's two exporters the one that traces is deprecated, and needs no further package
+        warnings.simplefilter("ignore", DeprecationWarning)
         raw = Path(folder) / "policy.onnx"
         torch.onnx.export(
             _Positional(policy).eval(),
