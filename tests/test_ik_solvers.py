@@ -8,10 +8,10 @@ import pinocchio as pin
 import pytest
 
 from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
-from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK, half_planes
+from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import Weights
-from wbc_baselines.ik.stance import base_from_stance, measured_stance
+from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
 from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.protocol import find_protocol
 from wbc_bench.robot import load_robot

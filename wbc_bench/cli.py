@@ -5,6 +5,7 @@ Each command is a frozen dataclass, its fields the options. Everything heavy is 
 
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -614,18 +615,23 @@ def _print_table(table) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point; exits with 2 on a mistake of the user and with 130 when interrupted."""
+    """Entry point; ends as `run_command` says."""
     os.environ.update(THREADS)
     command = tyro.cli(
         Command, prog="wbc-bench", description="Whole-body controllers on identical episodes.", args=arguments
     )
+    run_command(command.run, "finished shards are kept, the same command resumes")
+
+
+def run_command(run: Callable[[], None], interrupted: str) -> None:
+    """Run a command; exits with 2 on a mistake of the user and with 130, and a remark, when interrupted."""
     try:
-        command.run()
+        run()
     except BenchError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except BrokenPipeError:  # the reader went away, e.g. `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
-        print("interrupted: finished shards are kept, the same command resumes", file=sys.stderr)
+        print(f"interrupted: {interrupted}", file=sys.stderr)
         sys.exit(130)

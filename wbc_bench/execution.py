@@ -125,12 +125,14 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool
     with ExitStack() as stack:
         runs = []
         for job in jobs:
+            built: dict[str, tuple[Controller, str]] = {}  # spec -> controller, digest of its software
             for replicate in job.replicates:
                 # one controller may meet all replicates, or another one each
                 spec = spec_of_replicate(job.spec, replicate)
-                controller = load_controller(spec, load_robot(job.protocol.robot))
-                software = provenance.software_digest(controller)
-                runs.append(_Run(job, controller, replicate, software, store, redo))
+                if spec not in built:
+                    controller = load_controller(spec, load_robot(job.protocol.robot))
+                    built[spec] = controller, provenance.software_digest(controller)
+                runs.append(_Run(job, spec, *built[spec], replicate, store, redo))
                 stack.callback(runs[-1].writer.close)
         tasks = (task for number, run in enumerate(runs) for task in run.tasks(number))
         shared = {
@@ -157,9 +159,17 @@ class _Run:
     """One run of a job while it is evaluated."""
 
     def __init__(
-        self, job: Job, controller: Controller, replicate: int, software: str, store: ResultStore, redo: bool
+        self,
+        job: Job,
+        spec: str,
+        controller: Controller,
+        software: str,
+        replicate: int,
+        store: ResultStore,
+        redo: bool,
     ) -> None:
         self.job, self.replicate = job, replicate
+        self._spec = spec  # of the controller that meets this replicate
         self._controller = controller
         self._rows = job.manifest.of_replicate(replicate, job.episodes)
         self._started = float("inf")
@@ -178,8 +188,7 @@ class _Run:
     def tasks(self, number: int) -> Iterator[Task]:
         for shard in self.writer.missing:
             rows = self._rows.take(np.asarray(self.writer.rows(shard)))
-            spec = spec_of_replicate(self.job.spec, self.replicate)
-            yield Task(number, shard, spec, self.job.protocol, rows)
+            yield Task(number, shard, self._spec, self.job.protocol, rows)
 
     def report_kept(self) -> None:
         """Say what is not evaluated again, and whether other code made it: nobody may take it for new."""

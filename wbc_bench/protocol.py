@@ -4,7 +4,6 @@ A protocol is a TOML file; every field is checked when it is decoded, and a mist
 Its digest covers the meaning of the file, not its layout or comments.
 """
 
-import hashlib
 import math
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
@@ -13,6 +12,7 @@ import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
 from wbc_bench.robot import RobotConfig, load_facts
+from wbc_bench.schema import meaning_digest, read_toml
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
@@ -160,9 +160,7 @@ class EvalProtocol(_Table, frozen=True):
     @property
     def digest(self) -> str:
         """SHA-256 over the canonical JSON of every field but the description."""
-        fields = msgspec.to_builtins(self)
-        del fields["description"]
-        return hashlib.sha256(msgspec.json.encode(fields, order="deterministic")).hexdigest()
+        return meaning_digest(self)
 
 
 def load_protocol(path: Path) -> EvalProtocol:
@@ -171,12 +169,7 @@ def load_protocol(path: Path) -> EvalProtocol:
     Raises:
         ProtocolError: unreadable, an unknown key, a wrong type or an impossible range; names the field.
     """
-    try:
-        protocol = msgspec.toml.decode(path.read_bytes(), type=EvalProtocol)
-    except FileNotFoundError as error:
-        raise ProtocolError(f"protocol file '{path}' does not exist") from error
-    except (OSError, msgspec.DecodeError) as error:
-        raise ProtocolError(f"protocol {path}: {error}") from error
+    protocol = read_toml(path, EvalProtocol, "protocol", ProtocolError)
     _check(protocol, path)
     return protocol
 

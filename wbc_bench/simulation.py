@@ -16,7 +16,30 @@ Array = NDArray[np.float64]
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
 MAX_SPEED = 1e3  # [m/s, rad/s] of any coordinate; beyond it the integration has diverged
 # on these MuJoCo resets the simulation or zeroes its controls, and goes on as if nothing had happened
-_FATAL = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC", "CTRL")]
+FATAL_WARNINGS = [
+    getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC", "CTRL")
+]
+
+
+class Places(NamedTuple):
+    """Where the arrays of a model hold what is read of the robot."""
+
+    tcp: int  # site
+    soles: list[int]  # sites, left and right
+    sole_force: NDArray[np.int64]  # (2, 3) columns of the sensors
+    ground: NDArray[np.int64]  # columns of the sensors: contacts of other parts than the feet
+
+
+def places_of(model: mujoco.MjModel) -> Places:
+    """The places of a model that `Robot.model` built."""
+    names = [model.sensor(i).name for i in range(model.nsensor)]
+    address = {name: int(model.sensor_adr[i]) for i, name in enumerate(names)}
+    return Places(
+        tcp=model.site("tcp").id,
+        soles=[model.site(f"sole_{side}").id for side in "LR"],
+        sole_force=np.add.outer([address["sole_L_force"], address["sole_R_force"]], np.arange(3)),
+        ground=np.array([address[name] for name in names if name.startswith("ground_")]),
+    )
 
 
 class State(NamedTuple):
@@ -53,12 +76,7 @@ class Simulation:
         self._qpos, self._qvel, self._ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
         self._torque, self._sensor = batch.bind("actuator_force"), batch.bind("sensordata")
-        self._tcp = model.site("tcp").id
-        self._feet = [model.site(f"sole_{side}").id for side in "LR"]
-        names = [model.sensor(i).name for i in range(model.nsensor)]
-        address = {name: model.sensor_adr[i] for i, name in enumerate(names)}
-        self._ground = np.array([address[name] for name in names if name.startswith("ground_")])
-        self._soles = np.add.outer([address["sole_L_force"], address["sole_R_force"]], np.arange(3))
+        self._places = places_of(model)
         self._reset()
 
     def _randomise(self, model: mujoco.MjModel) -> None:
@@ -104,9 +122,9 @@ class Simulation:
 
     def state(self) -> State:
         """The state now; arrays are copies or freshly computed."""
-        qpos, qvel = self._qpos.copy(), self._qvel.copy()
+        qpos, qvel, at = self._qpos.copy(), self._qvel.copy(), self._places
         speed = np.abs(qvel).max(axis=1)
-        fatal = np.any(self._batch.warning[:, _FATAL, 1] > 0, axis=1)
+        fatal = np.any(self._batch.warning[:, FATAL_WARNINGS, 1] > 0, axis=1)
         return State(
             base_pos_w=qpos[:, :3],
             base_rot_w=matrix_from_wxyz(qpos[:, 3:7]),
@@ -115,10 +133,10 @@ class Simulation:
             joint_pos=qpos[:, 7:],
             joint_vel=qvel[:, 6:],
             joint_torque=self._torque.copy(),
-            ee_pos_w=self._site_xpos[:, self._tcp].copy(),
-            ee_rot_w=self._site_xmat[:, self._tcp].reshape(-1, 3, 3).copy(),
-            foot_pos_w=self._site_xpos[:, self._feet],
-            foot_force_w=self._sensor[:, self._soles],
-            ground_contact=np.any(self._sensor[:, self._ground] > 0, axis=1),
+            ee_pos_w=self._site_xpos[:, at.tcp].copy(),
+            ee_rot_w=self._site_xmat[:, at.tcp].reshape(-1, 3, 3).copy(),
+            foot_pos_w=self._site_xpos[:, at.soles],
+            foot_force_w=self._sensor[:, at.sole_force],
+            ground_contact=np.any(self._sensor[:, at.ground] > 0, axis=1),
             diverged=~(np.isfinite(qpos).all(axis=1) & (speed < MAX_SPEED)) | fatal,
         )

@@ -1,6 +1,5 @@
 """Targets from a file: waypoints, laps of a curve, or strokes over a board, with speed limits."""
 
-import hashlib
 import itertools
 import math
 from collections.abc import Mapping
@@ -12,6 +11,7 @@ import numpy as np
 
 from wbc_bench.errors import SourceError
 from wbc_bench.rotations import matrix_from_rpy, wxyz_from_matrix
+from wbc_bench.schema import meaning_digest, read_toml
 from wbc_bench.sources.interface import Frame, Seen, StampedTarget, from_world
 from wbc_bench.sources.paths import MAX_CYCLES, Path, Piece, Rest, laps, line
 from wbc_bench.sources.slew import Limits, Pose
@@ -110,9 +110,7 @@ class Script(_Table, frozen=True):
     @property
     def digest(self) -> str:
         """SHA-256 over the canonical JSON of every field but the description."""
-        fields = msgspec.to_builtins(self)
-        del fields["description"]
-        return hashlib.sha256(msgspec.json.encode(fields, order="deterministic")).hexdigest()
+        return meaning_digest(self)
 
 
 def load_script(path: File) -> Script:
@@ -121,12 +119,7 @@ def load_script(path: File) -> Script:
     Raises:
         SourceError: unreadable, an unknown key, a wrong type or an impossible number; names the field.
     """
-    try:
-        script = msgspec.toml.decode(path.read_bytes(), type=Script)
-    except FileNotFoundError as error:
-        raise SourceError(f"source file '{path}' does not exist") from error
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise SourceError(f"source {path}: {error}") from error
+    script = read_toml(path, Script, "source", SourceError)
     _check(script, path)
     return script
 

@@ -18,10 +18,10 @@ import qpsolvers
 from numpy.typing import NDArray
 
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel, configuration
-from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK, half_planes
+from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import TUNED, Weights
-from wbc_baselines.ik.stance import base_from_stance, measured_stance
+from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
 from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.protocol import find_protocol
 from wbc_bench.robot import JOINT_NAMES, Robot, load_robot

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from wbc_baselines.ik.balance import distribute, friction_rays
 from wbc_baselines.ik.estimation import ComFilter, GravityFilter, JointFilter
 from wbc_baselines.ik.hand import solve_arm
-from wbc_baselines.ik.model import GRAVITY, Pose, WholeBodyModel, configuration
+from wbc_baselines.ik.model import GRAVITY, Pose, WholeBodyModel, configuration, leg_of
 from wbc_baselines.ik.reference import Reference, plan
 from wbc_baselines.ik.settings import Settings
 from wbc_baselines.ik.stance import Stance, base_from_sole, base_from_stance, measured_stance, yaw_matrix
@@ -151,7 +151,7 @@ class IKController:
             capture, rate = e.com.capture_point()
             if outside(capture, e.hull) > s.step_trigger or self._may_widen(e, capture, rate):
                 side = choose(s, e.stance, capture, rate, model.corners)
-                e.swing = Swing(side, s.step_duration, joints[_leg(side)].copy())
+                e.swing = Swing(side, s.step_duration, joints[leg_of(side)].copy())
         return True
 
     def _may_widen(self, e: _Episode, capture: Array, rate: float) -> bool:
@@ -160,7 +160,8 @@ class IKController:
         if e.prepared or e.step * PERIOD < s.step_prepare_time:
             return False
         e.prepared = True
-        if e.stance.width() > s.step_prepare:
+        # a step swings the hand: one that is at its target already stays there
+        if e.stance.width() > s.step_prepare or e.reference.left < s.step_prepare_way:
             return False
         side = choose(s, e.stance, capture, rate, model.corners)
         wider = e.stance.moved(
@@ -192,7 +193,7 @@ class IKController:
         com = e.com.pos[:2]
         shift = (np.cosh(grow) - 1) * (com - p) + np.sinh(grow) / rate * e.com.vel[:2]
         yaw = yaw_matrix(float(e.stance.yaw[stand]))
-        leg, standing = _leg(swing.side), _leg(stand)
+        leg, standing = leg_of(swing.side), leg_of(stand)
         goals = []
         for part, height in ((1.0, -s.step_press), (0.5, s.step_height)):
             start = e.stance.xy[swing.side]
@@ -252,10 +253,6 @@ class IKController:
         for jacobian, arm, force in zip(jacobians, arms, np.split(forces, len(arms)), strict=True):
             torques -= jacobian.T @ np.concatenate([force.sum(axis=0), moment_of(arm, force)])
         return torques[6:]
-
-
-def _leg(side: int) -> slice:
-    return slice(4 * side, 4 * side + 4)
 
 
 def moment_of(arms: Array, forces: Array) -> Array:

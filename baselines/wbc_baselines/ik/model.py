@@ -50,7 +50,7 @@ class WholeBodyModel:
         self._q[7:] = joints
         pin.computeJointJacobians(self.model, self.data, self._q)
         pin.updateFramePlacement(self.model, self.data, self.soles[side])
-        return self.pose(self.soles[side]), self.jacobian(self.soles[side])[:, 6 + 4 * side : 10 + 4 * side]
+        return self.pose(self.soles[side]), self.jacobian(self.soles[side])[:, 6:][:, leg_of(side)]
 
     def torques(self, q: Array, base_acceleration: Array, joint_acceleration: Array) -> Array:
         """Joint torques (14,) [N m] that accelerate base (3,) [m/s^2] and joints (14,) from rest at q."""
@@ -85,6 +85,11 @@ class WholeBodyModel:
     def jacobian(self, frame: int) -> Array:
         """Jacobian (6, 20), linear over angular, world-aligned, after `update`."""
         return pin.getFrameJacobian(self.model, self.data, frame, pin.LOCAL_WORLD_ALIGNED)
+
+
+def leg_of(side: int) -> slice:
+    """The joints of the left (0) or the right (1) leg."""
+    return slice(4 * side, 4 * side + 4)
 
 
 def configuration(pos: Array, rot: Array, joints: Array) -> Array:

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel
 from wbc_baselines.ik.settings import Weights
+from wbc_baselines.ik.stance import half_planes
 from wbc_bench.robot import NUM_JOINTS, Robot
 
 Array = NDArray[np.float64]
@@ -198,13 +199,6 @@ class Clearance:
                 rows.append(row)
                 distances.append(result.min_distance)
         return np.array(rows).reshape(-1, model.nv), np.array(distances)
-
-
-def half_planes(hull: Array) -> tuple[Array, Array]:
-    """Outward unit normals (V, 2) and offsets (V,) [m] of a counter-clockwise polygon: normal x <= offset."""
-    edge = np.roll(hull, -1, axis=0) - hull
-    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1)[:, None]
-    return normal, (normal * hull).sum(axis=1)
 
 
 def solve(program: Program) -> Array | None:

@@ -73,6 +73,7 @@ class Settings:
     step_height: float = 0.06  # [m]
     step_prepare: float = 0.28  # [m] between the soles, below which a foot is set further out to begin with
     step_prepare_time: float = 0.6  # [s] of standing before that
+    step_prepare_way: float = 0.1  # [s] at full speed that the hand must still have to go
     step_prepare_error: float = 0.01  # [m + 0.3 m/rad] of the plan from there
     step_press: float = 0.01  # [m] below the ground that the landing foot is sent to
     step_length: float = 0.35  # [m] from the standing foot, either way

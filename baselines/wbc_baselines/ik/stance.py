@@ -43,6 +43,13 @@ class Stance(NamedTuple):
         return points[ConvexHull(points).vertices]
 
 
+def half_planes(hull: Array) -> tuple[Array, Array]:
+    """Outward unit normals (V, 2) and offsets (V,) [m] of a counter-clockwise polygon: normal x <= offset."""
+    edge = np.roll(hull, -1, axis=0) - hull
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1)[:, None]
+    return normal, (normal * hull).sum(axis=1)
+
+
 def yaw_matrix(yaw: float) -> Array:
     """Rotation (3, 3) about the vertical by an angle [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)

@@ -11,11 +11,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.model import Pose, WholeBodyModel
+from wbc_baselines.ik.model import Pose, WholeBodyModel, leg_of
 from wbc_baselines.ik.settings import Settings
-from wbc_baselines.ik.stance import Stance, yaw_matrix
+from wbc_baselines.ik.stance import Stance, half_planes, yaw_matrix
 
 Array = NDArray[np.float64]
+MISS = 5.0  # a metre missed counts as this many metres of way; choice
+LEG_DAMPING = 1e-4  # [m^2] of the leg's inverse kinematics near singular postures; choice
 OUTWARD = (1.0, -1.0)  # sign of y on the side of the left and of the right foot
 
 
@@ -58,8 +60,7 @@ class Swing:
 
 def outside(point: Array, hull: Array) -> float:
     """How far [m] a point (2,) is outside a counter-clockwise convex hull (V, 2); negative inside."""
-    edge = np.roll(hull, -1, axis=0) - hull
-    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1)[:, None]
+    normal, _ = half_planes(hull)
     return float(((point - hull) * normal).sum(axis=1).max())
 
 
@@ -97,7 +98,7 @@ def choose(s: Settings, stance: Stance, capture: Array, rate: float, corners: Ar
     cost = []
     for side in (0, 1):
         where = landing(s, stance, side, capture, rate, s.step_duration, corners)
-        cost.append(5.0 * where.miss + float(np.linalg.norm(where.xy - stance.xy[side])))
+        cost.append(MISS * where.miss + float(np.linalg.norm(where.xy - stance.xy[side])))
     return int(np.argmin(cost))
 
 
@@ -106,7 +107,7 @@ def solve_leg(model: WholeBodyModel, joints: Array, side: int, pose_b: Pose) -> 
 
     Damped Gauss-Newton; without an ankle roll the sole's roll and yaw follow.
     """
-    leg = slice(4 * side, 4 * side + 4)
+    leg = leg_of(side)
     trial = joints.copy()
     for _ in range(4):
         (pos, rot), jacobian = model.leg_in_base(trial, side)
@@ -116,6 +117,6 @@ def solve_leg(model: WholeBodyModel, joints: Array, side: int, pose_b: Pose) -> 
         error[3] = axis @ (rot @ pin.log3(rot.T @ pose_b[1]))
         rows = np.concatenate([jacobian[:3], (axis @ jacobian[3:])[None]])
         gram = rows @ rows.T
-        gram[np.diag_indices(4)] += 1e-4
+        gram[np.diag_indices(4)] += LEG_DAMPING
         trial[leg] += rows.T @ np.linalg.solve(gram, error)
     return trial[leg]

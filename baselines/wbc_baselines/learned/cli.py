@@ -10,7 +10,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, subcommand
 
 from wbc_baselines.learned.settings import Settings, TrainingError
-from wbc_bench.errors import BenchError
+from wbc_bench.cli import run_command
 
 RUNS = Path("runs")
 
@@ -168,17 +168,10 @@ Command = (
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point; exits with 2 on a mistake of the user and with 130 when interrupted."""
+    """Entry point; ends as `run_command` says."""
     # a worker of torch that spins while it waits would take a core from the physics threads
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     command = tyro.cli(
         Command, prog="wbc-train", description="Train the learned controllers.", args=arguments
     )
-    try:
-        command.run()
-    except BenchError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted: the same command resumes at the last checkpoint", file=sys.stderr)
-        sys.exit(130)
+    run_command(command.run, "the same command resumes at the last checkpoint")

@@ -7,6 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from wbc_bench.simulation import Places
+
 MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10 ms steps counts as diverged
 
 
@@ -41,6 +43,26 @@ class State(NamedTuple):
         """Overwrite the simulations `ids` (K,) with the rows of another state."""
         for mine, theirs in zip(self, rows, strict=True):
             mine[ids] = theirs
+
+
+def state_of(
+    places: Places, qpos: Tensor, qvel: Tensor, torque: Tensor, pos: Tensor, rot: Tensor, sensor: Tensor
+) -> State:
+    """The state in arrays of an engine: sites' `pos` (N, S, 3) and `rot` (N, S, 3, 3), `sensor` (N, C)."""
+    tcp, soles = places.tcp, places.soles
+    force, ground = places.sole_force.ravel().tolist(), places.ground.tolist()
+    return State(
+        qpos=qpos,
+        qvel=qvel,
+        torque=torque,
+        ee_pos_w=pos[:, tcp].contiguous(),
+        ee_rot_w=rot[:, tcp].contiguous(),
+        feet_pos_w=pos[:, soles],
+        feet_up_w=rot[:, soles, :2, 2].contiguous(),
+        foot_force_w=sensor[:, force].unflatten(-1, (2, 3)),
+        ground_contact=(sensor[:, ground] > 0).any(-1),
+        diverged=~((qvel.abs() < MAX_SPEED).all(-1) & qpos.isfinite().all(-1)),
+    )
 
 
 class Backend(Protocol):

@@ -7,13 +7,12 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.backends.base import MAX_SPEED, Start, State
+from wbc_baselines.learned.backends.base import Start, State, state_of
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+from wbc_bench.simulation import FATAL_WARNINGS, places_of
 
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
-# on these MuJoCo resets the simulation or zeroes its controls, and goes on as if nothing had happened
-_FATAL = [getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}").value for name in ("QPOS", "QVEL", "QACC", "CTRL")]
 _STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
 _MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
 
@@ -31,11 +30,7 @@ class CpuBackend:
         self._fields = {name: batch.expand(name) for name in _MODEL}
         outputs = {name: batch.bind(name) for name in ("site_xpos", "site_xmat", "sensordata")}
         self._out = outputs | {"actuator_force": batch.bind("actuator_force")}
-        self._sites = [model.site(name).id for name in ("tcp", "sole_L", "sole_R")]
-        names = [model.sensor(i).name for i in range(model.nsensor)]
-        address = {name: int(model.sensor_adr[i]) for i, name in enumerate(names)}
-        self._ground = [address[name] for name in names if name.startswith("ground_")]
-        self._soles = [address[f"sole_{side}_force"] + k for side in "LR" for k in range(3)]
+        self._places = places_of(model)
         self._base = model.body(robot.facts.base).id
 
     def reset(self, ids: NDArray[np.int64], start: Start) -> State:
@@ -79,21 +74,9 @@ class CpuBackend:
         qpos, qvel = take(self._state["qpos"]), take(self._state["qvel"])
         pos, rot = take(self._out["site_xpos"]), take(self._out["site_xmat"]).unflatten(-1, (3, 3))
         sensor = take(self._out["sensordata"])
-        tcp, soles = self._sites[0], self._sites[1:]
-        sound = (qvel.abs() < MAX_SPEED).all(-1) & qpos.isfinite().all(-1)
-        fatal = torch.from_numpy((self._batch.warning[ids][:, _FATAL, 1] > 0).any(1))
-        return State(
-            qpos=qpos,
-            qvel=qvel,
-            torque=take(self._out["actuator_force"]),
-            ee_pos_w=pos[:, tcp].contiguous(),
-            ee_rot_w=rot[:, tcp].contiguous(),
-            feet_pos_w=pos[:, soles],
-            feet_up_w=rot[:, soles, :2, 2].contiguous(),
-            foot_force_w=sensor[:, self._soles].unflatten(-1, (2, 3)),
-            ground_contact=(sensor[:, self._ground] > 0).any(-1),
-            diverged=~sound | fatal,
-        )
+        state = state_of(self._places, qpos, qvel, take(self._out["actuator_force"]), pos, rot, sensor)
+        fatal = torch.from_numpy((self._batch.warning[ids][:, FATAL_WARNINGS, 1] > 0).any(1))
+        return state._replace(diverged=state.diverged | fatal)
 
     def save(self) -> dict[str, NDArray]:
         return {name: array.copy() for name, array in (self._state | self._fields).items()}

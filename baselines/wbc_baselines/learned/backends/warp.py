@@ -15,10 +15,11 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.backends.base import MAX_SPEED, Start, State
+from wbc_baselines.learned.backends.base import Start, State, state_of
 from wbc_baselines.learned.settings import TrainingError
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+from wbc_bench.simulation import places_of
 
 # Per world: 8 contacts of the soles, and room for what meets in a fall; 3 rows a contact, 14 joint limits.
 CONTACTS, ROWS = 24, 96
@@ -52,11 +53,7 @@ class WarpBackend:
         self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in _MODEL}
         outputs = ("site_xpos", "site_xmat", "actuator_force", "sensordata", "overflow")
         self._out = {name: wp.to_torch(getattr(self._d, name)) for name in outputs}
-        self._sites = [model.site(name).id for name in ("tcp", "sole_L", "sole_R")]
-        names = [model.sensor(i).name for i in range(model.nsensor)]
-        address = {name: int(model.sensor_adr[i]) for i, name in enumerate(names)}
-        self._ground = [address[name] for name in names if name.startswith("ground_")]
-        self._soles = [address[f"sole_{side}_force"] + k for side in "LR" for k in range(3)]
+        self._places = places_of(model)
         self._base = model.body(self._robot.facts.base).id
         robot = self._robot
         self._default_q, self._kp, self._kd, self._effort = (
@@ -153,20 +150,7 @@ class WarpBackend:
 
         qpos, qvel, sensor = take("qpos"), take("qvel"), take("sensordata")
         pos, rot = take("site_xpos"), take("site_xmat")
-        tcp, soles = self._sites[0], self._sites[1:]
-        sound = (qvel.abs() < MAX_SPEED).all(-1) & qpos.isfinite().all(-1)
-        return State(
-            qpos=qpos,
-            qvel=qvel,
-            torque=take("actuator_force"),
-            ee_pos_w=pos[:, tcp].contiguous(),
-            ee_rot_w=rot[:, tcp].contiguous(),
-            feet_pos_w=pos[:, soles],
-            feet_up_w=rot[:, soles, :2, 2].contiguous(),
-            foot_force_w=sensor[:, self._soles].unflatten(-1, (2, 3)),
-            ground_contact=(sensor[:, self._ground] > 0).any(-1),
-            diverged=~sound,
-        )
+        return state_of(self._places, qpos, qvel, take("actuator_force"), pos, rot, sensor)
 
     def save(self) -> dict[str, NDArray]:
         return {name: array.cpu().numpy().copy() for name, array in (self._state | self._fields).items()}
