@@ -100,12 +100,6 @@ class PlacoIK:
         return robot.state.q.copy()
 
 
-def _matrix(pose: Pose) -> Array:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose[1], pose[0]
-    return matrix
-
-
 def _load(robot: Robot) -> placo.RobotWrapper:
     """The robot with the pairs of parts that can meet: forearm, wrist and gripper with base and legs."""
     with tempfile.TemporaryDirectory() as folder, _quiet(Path(folder) / "log"):
