@@ -115,8 +115,8 @@ def test_truncated_and_altered_weights(path):
     [
         (b"", "cannot be read"),
         (b"\xff\xfe", "cannot be read"),
-        (b'{"format": 1}', "method"),
-        (b'{"format": 99}', "format 99, valid: 1"),
+        (b'{"format": 2}', "method"),
+        (b'{"format": 99}', "format 99, valid: 2"),
     ],
     ids=["empty", "binary", "incomplete", "another format"],
 )

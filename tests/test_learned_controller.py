@@ -1,6 +1,7 @@
 """The learned controller: what it reads, what it remembers, and one training seed a replicate."""
 
 import json
+import warnings
 from typing import Any
 
 import msgspec
@@ -261,3 +262,27 @@ def test_a_real_episode(smoke: EvalProtocol, tmp_path, calm_rows: CalmRows):
     a = evaluate(controller, smoke, calm_rows(3))
     b = evaluate(controller, smoke, calm_rows(3))
     assert a.steps.min() > 5 and np.array_equal(a.action, b.action, equal_nan=True)
+
+
+def test_conditions_other_than_the_training_s_are_listed():
+    protocol, _ = find_protocol("ablation_v1")
+    card = checkpoint.new_card("no_latent", 0, 0, 0.0, protocol)
+    controller = LearnedController(load_robot(), card, Policy(*networks("no_latent")), "mine", "")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        controller.prepare(protocol)
+    with pytest.warns(UserWarning, match=r"^mine .*: push\.speed: trained 0\.5, here 0\.0$"):
+        controller.prepare(find_protocol("nopush_v1")[0])
+    told = checkpoint.other_conditions(card, find_protocol("reach_v1")[0])
+    assert told == "push.speed: trained 0.5, here 0.0; targets.type: trained workspace, here reach"
+
+
+def test_the_physics_step_and_the_seed_are_no_conditions():
+    protocol, _ = find_protocol("ablation_v1")
+    card = checkpoint.new_card("no_latent", 0, 0, 0.0, protocol)
+    physics = msgspec.structs.replace(protocol.physics, timestep=0.01, decimation=2)
+    episodes = msgspec.structs.replace(protocol.episodes, seed=1, per_replicate=7)
+    other = msgspec.structs.replace(protocol, physics=physics, episodes=episodes, name="mine")
+    assert checkpoint.other_conditions(card, other) == ""
+    longer = msgspec.structs.replace(protocol, episodes=msgspec.structs.replace(episodes, horizon=20.0))
+    assert checkpoint.other_conditions(card, longer) == "episodes.horizon: trained 10.0, here 20.0"

@@ -7,7 +7,7 @@ gains, limits, default posture or end-effector frame of the robot are not those 
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import torch
@@ -25,7 +25,7 @@ from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of
 from wbc_bench.store import write_atomic
 
-FORMAT = 1
+FORMAT = 2
 CHECKPOINTS = Path(__file__).with_name("checkpoints")  # METHOD@SEED.safetensors and .json
 Numbers = tuple[float, ...]
 
@@ -77,6 +77,7 @@ class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     machine: dict[str, str | int | float]
     protocol: str
     protocol_digest: str
+    conditions: dict[str, Any]  # of `protocol`, `section.field` by value
     robot_digest: str  # SHA-256 over `robot`
     robot: RobotFacts
     git_commit: str | None
@@ -114,6 +115,38 @@ def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
     )
 
 
+def conditions(protocol: EvalProtocol) -> dict[str, Any]:
+    """What episodes of a protocol are like: `section.field` by value, as JSON holds it.
+
+    Left out is what no policy meets (names, counts, seed, the rule of success), what `RobotFacts` holds, and
+    the physics step, which is longer in training than in any evaluation.
+    """
+    sections = msgspec.to_builtins(protocol)
+    for name in ("name", "description", "success", "robot", "physics"):
+        del sections[name]
+    sections["episodes"] = {"horizon": sections["episodes"]["horizon"]}
+    found = {}
+    for section, value in sections.items():
+        if isinstance(value, dict):
+            found |= {f"{section}.{field}": item for field, item in value.items()}
+        else:
+            found[section] = value
+    return msgspec.json.decode(msgspec.json.encode(found))
+
+
+def other_conditions(card: Card, protocol: EvalProtocol) -> str:
+    """`field: trained X, here Y` of every condition of a protocol that differs from the training's."""
+    trained, here, lines = card.conditions, conditions(protocol), []
+    names, kind = trained.keys() | here.keys(), "targets.type"
+    if trained.get(kind) != here[kind]:  # then the other fields of targets have nothing in common
+        names = {name for name in names if name == kind or not name.startswith("targets.")}
+    for name in sorted(names):
+        then, now = trained.get(name, "not set"), here.get(name, "not set")
+        if then != now:
+            lines.append(f"{name}: trained {_short(then)}, here {_short(now)}")
+    return "; ".join(lines)
+
+
 def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> Card:
     """The card of a policy trained here, by this code: control steps and wall time [s] it took."""
     facts = robot_facts(load_robot(protocol.robot), protocol.control_period)
@@ -127,6 +160,7 @@ def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: E
         machine=provenance.machine(),
         protocol=protocol.name,
         protocol_digest=protocol.digest,
+        conditions=conditions(protocol),
         robot_digest=_digest(facts),
         robot=facts,
         git_commit=commit,
@@ -295,6 +329,10 @@ def _fill(path: Path, modules: dict[str, torch.nn.Module], tensors: dict[str, to
     refuse("not a number in", [name for name, v in tensors.items() if not v.isfinite().all()])
     for name, value in wanted.items():
         value.copy_(tensors[name])
+
+
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
 
 
 def _digest(facts: RobotFacts) -> str:

@@ -1,5 +1,6 @@
 """A trained policy as a controller of the bench: batched, deterministic, on one thread."""
 
+import warnings
 from pathlib import Path
 from typing import Protocol
 
@@ -49,8 +50,15 @@ class LearnedController:
         self._default_q = _tensor(robot.default_q)
 
     def prepare(self, protocol: EvalProtocol) -> None:
-        """Take the decay of the reference from the protocol. Raises: CheckpointError."""
+        """Take the decay of the reference from the protocol; warn of conditions other than the training's.
+
+        Raises: CheckpointError, see `checkpoint.check_fit`.
+        """
         checkpoint.check_fit(self.card, self._robot, protocol.control_period, self.info.name)
+        if differences := checkpoint.other_conditions(self.card, protocol):
+            warnings.warn(
+                f"{self.info.name} meets conditions it was not trained on: {differences}", stacklevel=2
+            )
         self._decay = protocol.reference_decay
 
     @torch.inference_mode()
