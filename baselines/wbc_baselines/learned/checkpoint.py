@@ -212,6 +212,19 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
     return Checkpoint(card, actor.eval(), estimator.eval())
 
 
+def load_start(name: str) -> Actor:
+    """The policy of a checkpoint that other methods can begin with: one without context.
+
+    Raises: CheckpointError, it has a context; and see `load`.
+    """
+    found = load(find(name))
+    if found.estimator.context_dim:
+        raise CheckpointError(
+            f"--start '{name}' is of {found.card.method}, valid: a method without a context"
+        )
+    return found.actor
+
+
 def read_card(path: Path) -> Card:
     """The card beside a safetensors file, itself whole and of a method and dimensions that exist here.
 

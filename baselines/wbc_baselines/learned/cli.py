@@ -130,6 +130,58 @@ class Gates:
 
 
 @dataclass(frozen=True)
+class Imitate:
+    """Make a start for `run --start`: a policy without context that imitates another controller."""
+
+    path: Path
+    """Where to: PATH.safetensors, a checkpoint that `wbc-bench eval --controller learned:PATH` can judge."""
+    teacher: str = "ik"
+    """SPEC of the controller to imitate."""
+    protocol: str = "ablation_v1"
+    """Whose targets, randomisation, noise and pushes."""
+    episodes: int = 300
+    """Episodes a round."""
+    rounds: int = 3
+    """Rounds; the student drives in none of the first's episodes, and in ever more of the later ones'."""
+    seed: int = 0
+    """Seed of draws and weights."""
+    workers: int = 2
+    """Processes; the result does not depend on it."""
+
+    def run(self) -> None:
+        import time
+
+        from wbc_baselines.learned import checkpoint
+        from wbc_baselines.learned.estimators import make_estimator
+        from wbc_baselines.learned.imitation import METHOD, imitate
+        from wbc_baselines.learned.pool import read_pool
+        from wbc_bench.progress import Progress
+        from wbc_bench.protocol import find_protocol
+
+        for name in ("episodes", "rounds", "workers"):
+            if getattr(self, name) < 1:
+                raise TrainingError(f"--{name} {getattr(self, name)}: valid: 1 or more")
+        if self.path.suffix != ".safetensors":
+            raise TrainingError(f"--path '{self.path}': valid: a name that ends in .safetensors")
+        protocol, _ = find_protocol(self.protocol)
+        begun = time.monotonic()
+        with Progress("episodes") as progress:
+            actor, error = imitate(
+                self.teacher,
+                protocol,
+                read_pool(protocol),
+                self.episodes,
+                self.rounds,
+                self.seed,
+                self.workers,
+                progress.update,
+            )
+        card = checkpoint.new_card(METHOD, self.seed, 0, time.monotonic() - begun, protocol)
+        checkpoint.save(self.path, actor, make_estimator("none"), card)
+        print(f"{self.path}: root mean square error of an action {error:.3f}")
+
+
+@dataclass(frozen=True)
 class Targets:
     """Draw the pool of feasible targets that training picks from (12,000: five minutes on two cores)."""
 
@@ -163,6 +215,7 @@ Command = (
     | Annotated[Status, subcommand("status")]
     | Annotated[Curves, subcommand("curves")]
     | Annotated[Gates, subcommand("gates")]
+    | Annotated[Imitate, subcommand("imitate")]
     | Annotated[Targets, subcommand("targets")]
 )
 

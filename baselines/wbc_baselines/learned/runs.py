@@ -66,12 +66,13 @@ class RunFolder:
         if not self.settings.exists():
             write_atomic(self.settings, json.dumps(mine, indent=2).encode())
             return
-        theirs = json.loads(self.settings.read_text())
-        mine = json.loads(json.dumps(mine))  # tuples become lists
+        # a setting that is newer than the run had its default
+        theirs = asdict(Settings(settings.method)) | json.loads(self.settings.read_text())
+        mine, theirs = (json.loads(json.dumps(s)) for s in (mine, theirs))  # tuples become lists
         wrong = [
-            f"{name} {theirs.get(name)} -> {value}"
+            f"{name} {theirs[name]} -> {value}"
             for name, value in mine.items()
-            if name not in FREE and theirs.get(name) != value
+            if name not in FREE and theirs[name] != value
         ]
         if wrong:
             raise TrainingError(

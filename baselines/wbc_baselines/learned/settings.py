@@ -48,6 +48,12 @@ class Settings:
     """PPO's clip."""
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
+    start: str = ""
+    """Checkpoint without context that the policy begins with (`wbc-train imitate`); else random weights."""
+    start_samples: int = 200_000
+    """Observations that the start's normaliser counts for."""
+    critic_iterations: int = 0
+    """First iterations in which only the critic learns: it knows nothing of a start's returns."""
     std_legs: float = 0.4
     """Standard deviation of the leg actions at the start."""
     std_arm: float = 1.0

@@ -22,6 +22,7 @@ from torch import Tensor
 from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment, Step
 from wbc_baselines.learned.estimators import Batch, make_estimator
+from wbc_baselines.learned.imitation import begin_with
 from wbc_baselines.learned.inputs import ACTIONS, HISTORY, HISTORY_TERM, NEXT_OBSERVATION, History
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.networks import HIDDEN, Actor
@@ -142,6 +143,8 @@ class Trainer:
         std[:NUM_LEG_JOINTS] = settings.std_legs
         with torch.no_grad():
             actor.distribution.log_std_param.copy_(std.log())  # type: ignore[union-attr]
+            if settings.start:
+                begin_with(actor, checkpoint.load_start(settings.start), settings.start_samples)
         storage = RolloutStorage("rl", settings.envs, settings.steps, seen, [ACTIONS], str(self.device))
         ppo = PPO(
             actor,
@@ -162,13 +165,18 @@ class Trainer:
         )
         least = settings.least_learning_rate
 
-        def floor(optimizer: torch.optim.Optimizer, *_: object) -> None:
+        def bound(optimizer: torch.optim.Optimizer, *_: object) -> None:
+            rate = max(ppo.learning_rate, least)
+            if self.iteration < settings.critic_iterations:
+                rate = settings.learning_rate  # a policy at rest has no divergence to adapt to
+                for parameter in actor.parameters():
+                    parameter.grad = None
+            ppo.learning_rate = rate
             for group in optimizer.param_groups:
-                group["lr"] = max(group["lr"], least)
-            ppo.learning_rate = max(ppo.learning_rate, least)
+                group["lr"] = rate
 
-        # PPO has no option for the least learning rate
-        ppo.optimizer.register_step_pre_hook(floor)
+        # PPO has no option for the least learning rate, nor for a critic that learns alone
+        ppo.optimizer.register_step_pre_hook(bound)
         return ppo
 
     # ---- one iteration -------------------------------------------------------------------------------------

@@ -1,0 +1,264 @@
+"""A start for all methods alike: a policy without context that imitates another controller of the bench.
+
+DAgger: the teacher answers in every state, but the student drives in a growing part of the episodes, so that
+the states are those a policy meets and not only those a teacher leaves behind. Source: Ross, Gordon, Bagnell
+2011, "A reduction of imitation learning and structured prediction to no-regret online learning".
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wbc_baselines.learned.checkpoint import new_card
+from wbc_baselines.learned.controller import LearnedController
+from wbc_baselines.learned.estimators import make_estimator
+from wbc_baselines.learned.inputs import COMMAND, OBSERVATION
+from wbc_baselines.learned.networks import Actor
+from wbc_baselines.learned.policy import flow_of
+from wbc_baselines.learned.pool import TargetPool
+from wbc_baselines.learned.starts import draw_starts
+from wbc_bench.control_loop import ControlLoop
+from wbc_bench.controller import (
+    Controller,
+    ControllerInfo,
+    JointCommand,
+    Observation,
+    ProtocolAware,
+    Target,
+    load_controller,
+)
+from wbc_bench.episodes import STRATA
+from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.protocol import EvalProtocol
+from wbc_bench.randomness import stream
+from wbc_bench.robot import Robot, load_robot
+
+METHOD = "no_latent"  # the one whose policy has no context
+SHARD = 25  # episodes that are recorded together
+INPUTS = OBSERVATION + COMMAND
+LIMIT = 3.0  # of a normalised action; choice: an answer beyond it is one to a fall, and not to be learned
+
+Progress = Callable[[int, int], None]
+
+
+class Lessons(NamedTuple):
+    """What the teacher answered to what a policy sees."""
+
+    seen: NDArray[np.float32]  # (M, 67) observation and command
+    action: NDArray[np.float32]  # (M, 14) normalised
+
+    @classmethod
+    def joined(cls, parts: "list[Lessons]") -> "Lessons":
+        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+class _Driver:
+    """The engine of the student: drives where it is told to, and leaves the rest to the teacher."""
+
+    flow = flow_of(make_estimator("none"))
+
+    def __init__(self, student: Actor | None, drives: Tensor) -> None:
+        self.student, self.drives = student, drives
+        self.answer, self.seen = torch.empty(0), torch.empty(0)
+
+    def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
+        self.seen = torch.cat([values["observation"], values["command"]], dim=-1)
+        action = self.answer
+        if self.student:
+            action = torch.where(self.drives[:, None], self.student(self.seen), action)
+        return {"action": action}
+
+
+class Pupil:
+    """A controller in which teacher and student see the same episodes, and one of them drives each."""
+
+    def __init__(
+        self, robot: Robot, protocol: EvalProtocol, teacher: Controller, student: Actor | None, drives: Tensor
+    ) -> None:
+        self._teacher, self._robot, self._driver = teacher, robot, _Driver(student, drives)
+        card = new_card(METHOD, 0, 0, 0.0, protocol)
+        self._hands = LearnedController(robot, card, self._driver, "pupil", "")
+        signals = teacher.info.signals | self._hands.info.signals
+        self.info = ControllerInfo("pupil", signals, protocol.control_period, "wbc_baselines.learned")
+        self.lessons: list[Lessons] = []
+
+    def prepare(self, protocol: EvalProtocol) -> None:
+        for part in (self._teacher, self._hands):
+            if isinstance(part, ProtocolAware):
+                part.prepare(protocol)
+
+    def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
+        self._teacher.reset(episodes, obs, target)
+        self._hands.reset(episodes, obs, target)
+
+    def act(self, obs: Observation, target: Target) -> JointCommand:
+        wanted = self._robot.action_of(self._teacher.act(obs, target).q)
+        self._driver.answer = torch.from_numpy(wanted.astype(np.float32))
+        command = self._hands.act(obs, target)
+        sound = obs.active & (np.abs(wanted) < LIMIT).all(axis=1)
+        self.lessons.append(Lessons(self._driver.seen.numpy()[sound], wanted[sound].astype(np.float32)))
+        return command
+
+
+def record(
+    spec: str,
+    protocol: EvalProtocol,
+    pool: TargetPool,
+    episodes: int,
+    seed: int,
+    student: Actor | None = None,
+    share: float = 0.0,
+    workers: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> Lessons:
+    """Lessons of `episodes` episodes, in a part `share` of which the student drives; for any `workers`.
+
+    Targets come from training's pool and draws from streams of training's own, so no evaluation meets them.
+    """
+    tasks = range(-(-episodes // SHARD))
+    student_state = student.state_dict() if student else None
+    parts, found = (
+        [],
+        Parallel(n_jobs=workers, return_as="generator")(
+            delayed(_record_shard)(
+                spec, protocol, pool, seed, k, min(SHARD, episodes - k * SHARD), student_state, share
+            )
+            for k in tasks
+        ),
+    )
+    for part in found:
+        parts.append(part)
+        progress(min(len(parts) * SHARD, episodes), episodes)
+    return Lessons.joined(parts)
+
+
+def _record_shard(
+    spec: str,
+    protocol: EvalProtocol,
+    pool: TargetPool,
+    seed: int,
+    number: int,
+    count: int,
+    student_state: dict | None,
+    share: float,
+) -> Lessons:
+    student = None
+    if student_state:
+        student = Actor(0)
+        student.load_state_dict(student_state)
+    rng = stream(seed, "lessons", number)
+    robot, rows = load_robot(protocol.robot), draw_rows(protocol, pool, count, rng)
+    drives = torch.from_numpy(rng.random(count) < share)
+    pupil = Pupil(robot, protocol, load_controller(spec, robot), student, drives)
+    loop = ControlLoop(pupil, protocol, rows)
+    target = loop.sensors.target(loop.state)
+    loop.reset(target)
+    for _ in range(protocol.num_steps):
+        loop.advance(target)
+        if not loop.active.any():
+            break
+        target = loop.sensors.target(loop.state)
+    return Lessons.joined(pupil.lessons)
+
+
+def draw_rows(
+    protocol: EvalProtocol, pool: TargetPool, count: int, rng: np.random.Generator
+) -> EpisodeManifest:
+    """Training's episodes as rows of a manifest."""
+    draws = draw_starts(protocol, pool, count, rng)
+    start, chosen = draws.start, draws.target
+    pos = pool.pos_w[chosen].astype(np.float64)
+    none, number = np.full(count, "", dtype=object), np.arange(count)
+    return EpisodeManifest(
+        replicate=np.zeros(count, np.int64),
+        episode=number,
+        stratum=np.array([STRATA[k] for k in pool.stratum[chosen]], dtype=object),
+        condition=none,
+        orientation=none,
+        height=pos[:, 2],
+        target_pos_w=pos,
+        target_quat_w=pool.quat_w[chosen].astype(np.float64),
+        witness_qpos=np.full((count, 21), np.nan),
+        **start._asdict(),
+        push_time=np.where(draws.push_step < 0, np.nan, draws.push_step * protocol.control_period),
+        push_vel=draws.push_vel.reshape(count, -1),
+        noise_key=rng.integers(2**63 - 1, size=count),
+        noise_scale=np.ones(count),
+    )
+
+
+def fit(
+    lessons: Lessons, seed: int, epochs: int = 20, batch: int = 4096, learning_rate: float = 1e-3
+) -> tuple[Actor, float]:
+    """The policy that answers most like the teacher, and its root mean square error on a tenth held out.
+
+    Normalisers are those of the lessons; the learning rate falls to zero along a cosine.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    seen, action = map(torch.from_numpy, lessons)
+    held = len(seen) // 10  # the last ones, which are whole episodes
+    actor = Actor(0)
+    actor.normalizer.update(seen)
+    optimizer = torch.optim.Adam(actor.mlp.parameters(), learning_rate)
+    known = len(seen) - held
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * -(-known // batch))
+    for _ in range(epochs):
+        for chosen in torch.randperm(known, generator=generator).split(batch):
+            loss = (actor(seen[chosen]) - action[chosen]).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+    with torch.no_grad():
+        error = (actor(seen[known:]) - action[known:]).square().mean().sqrt()
+    return actor.eval(), float(error)
+
+
+def imitate(
+    spec: str,
+    protocol: EvalProtocol,
+    pool: TargetPool,
+    episodes: int,
+    rounds: int,
+    seed: int,
+    workers: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> tuple[Actor, float]:
+    """DAgger: `rounds` of `episodes` each, the student driving a part k / rounds of those of round k.
+
+    Returns the policy fitted to all lessons, and its root mean square error on the newest tenth.
+    """
+    parts: list[Lessons] = []
+    student, error = None, float("nan")
+    for k in range(rounds):
+
+        def told(done: int, _: int, before: int = k * episodes) -> None:
+            progress(before + done, rounds * episodes)
+
+        key = seed * rounds + k
+        parts.append(record(spec, protocol, pool, episodes, key, student, k / rounds, workers, told))
+        student, error = fit(Lessons.joined(parts), seed)
+    assert student is not None
+    return student, error
+
+
+def begin_with(actor: torch.nn.Module, start: Actor, samples: int) -> None:
+    """Give rsl-rl's actor the weights of a start; columns of a context begin without effect.
+
+    samples: how many observations the start's normaliser counts for, before it follows training's own.
+    """
+    weights, mine = start.mlp.state_dict(), actor.mlp.state_dict()  # type: ignore[union-attr]
+    first = torch.zeros_like(mine["0.weight"])
+    first[:, :INPUTS] = weights["0.weight"]
+    actor.mlp.load_state_dict(weights | {"0.weight": first})  # type: ignore[union-attr]
+    normalizer = actor.obs_normalizer
+    normalizer._mean[0, :INPUTS] = start.normalizer.mean  # type: ignore[index]
+    normalizer._var[0, :INPUTS] = start.normalizer.std.square()  # type: ignore[index]
+    normalizer._std[0, :INPUTS] = start.normalizer.std  # type: ignore[index]
+    normalizer.count.fill_(samples)  # type: ignore[union-attr]

@@ -1,0 +1,130 @@
+"""A start from another controller: who drives, what is recorded, that all methods begin with the same."""
+
+import msgspec
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("rsl_rl")
+
+from learned import write  # noqa: E402
+from tensordict import TensorDict  # noqa: E402
+from test_learned_environment import POOL  # noqa: E402
+from test_learned_training import trainer  # noqa: E402
+
+from wbc_baselines.learned import checkpoint  # noqa: E402
+from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
+from wbc_baselines.learned.cli import main  # noqa: E402
+from wbc_baselines.learned.estimators import make_estimator  # noqa: E402
+from wbc_baselines.learned.imitation import INPUTS, Lessons, begin_with, fit, record  # noqa: E402
+from wbc_baselines.learned.networks import Actor  # noqa: E402
+from wbc_bench.protocol import find_protocol  # noqa: E402
+
+ACTION = slice(34, 48)  # of the observation: the action of the step before
+
+
+def short_protocol():
+    protocol, _ = find_protocol("ablation_v1")
+    episodes = msgspec.structs.replace(protocol.episodes, horizon=0.2)
+    push = msgspec.structs.replace(protocol.push, interval=(0.05, 0.06), quiet_end=0.0)
+    return msgspec.structs.replace(protocol, episodes=episodes, push=push)
+
+
+def constant(value: float) -> Actor:
+    actor = Actor(0)
+    state = {name: torch.zeros_like(tensor) for name, tensor in actor.state_dict().items()}
+    state |= {"mlp.6.bias": torch.full((14,), value), "normalizer.std": torch.ones(INPUTS)}
+    actor.load_state_dict(state)
+    return actor
+
+
+def start_at(path, seed: int = 0) -> Actor:
+    torch.manual_seed(seed)
+    actor = Actor(0)
+    actor.normalizer.mean.normal_()
+    actor.normalizer.std.uniform_(0.5, 2.0)
+    card = checkpoint.new_card("no_latent", 0, 0, 0.0, find_protocol("ablation_v1")[0])
+    checkpoint.save(path, actor, make_estimator("none"), card)
+    return actor.eval()
+
+
+def test_the_teacher_answers_wherever_the_student_drives():
+    protocol = short_protocol()
+    own = record("hold", protocol, POOL, 3, seed=1)
+    assert (
+        own.seen.shape == (3 * 10, INPUTS) and (own.action == 0).all()
+    )  # `hold` asks for the default posture
+    assert (own.seen[:, ACTION] == 0).all()
+    driven = record("hold", protocol, POOL, 3, seed=1, student=constant(0.5), share=1.0)
+    assert (driven.action == 0).all()
+    assert (driven.seen[:3, ACTION] == 0).all() and (driven.seen[3:, ACTION] == 0.5).all()
+    # the same episodes until the student has moved them
+    assert np.array_equal(own.seen[:3], driven.seen[:3]) and not np.array_equal(own.seen[-1], driven.seen[-1])
+
+
+def test_lessons_do_not_depend_on_the_number_of_workers():
+    protocol = short_protocol()
+    one, two = (record("hold", protocol, POOL, 30, seed=2, workers=n) for n in (1, 2))
+    assert np.array_equal(one.seen, two.seen) and len(one.seen) == 30 * 10
+
+
+def test_fit_finds_a_linear_teacher():
+    rng = np.random.default_rng(0)
+    seen = rng.normal(3.0, 2.0, (20_000, INPUTS)).astype(np.float32)
+    action = (0.2 * (seen[:, :14] - 3.0)).astype(np.float32)
+    actor, error = fit(Lessons(seen, action), seed=0, epochs=10, batch=500)
+    assert error < 0.05  # of 0.4
+    again, same = fit(Lessons(seen, action), seed=0, epochs=10, batch=500)
+    assert error == same and torch.equal(actor.mlp[0].weight, again.mlp[0].weight)
+
+
+@pytest.mark.parametrize("method", ["no_latent", "cenet", "transformer_gru", "oracle"])
+def test_every_method_begins_with_the_same_policy(method, tmp_path):
+    start = start_at(tmp_path / "start.safetensors")
+    t = trainer(method=method, start=str(tmp_path / "start.safetensors"))
+    actor = t.actor()
+    seen = torch.randn(5, INPUTS)
+    context = 10 * torch.randn(5, t.estimator.context_dim)
+    assert torch.allclose(actor(torch.cat([seen, context], -1)), start(seen), atol=1e-6)
+
+
+def test_first_only_the_critic_learns(tmp_path):
+    t = trainer(critic_iterations=1)
+    before = [p.clone() for p in t.ppo.actor.parameters()]
+    critic = [p.clone() for p in t.ppo.critic.parameters()]
+    found = t.iterate()
+    assert all(map(torch.equal, before, t.ppo.actor.parameters()))
+    assert not any(map(torch.equal, critic, t.ppo.critic.parameters()))
+    assert found["policy/learning_rate"] == t.settings.learning_rate
+    t.iterate()
+    assert not all(map(torch.equal, before, t.ppo.actor.parameters()))
+
+
+def test_a_start_has_no_context(tmp_path):
+    path = write(tmp_path / "a.safetensors", "cenet")
+    with pytest.raises(CheckpointError, match="is of cenet, valid: a method without a context"):
+        checkpoint.load_start(str(path))
+
+
+def test_the_normaliser_of_a_start_counts():
+    start = constant(0.0)
+    start.normalizer.mean.fill_(2.0)
+    t = trainer()
+    begin_with(t.ppo.actor, start, samples=1000)
+    t.ppo.actor.train().update_normalization(TensorDict({"policy": torch.zeros(1000, INPUTS)}, [1000]))
+    assert torch.allclose(t.actor().normalizer.mean, torch.ones(INPUTS))
+
+
+def test_imitate_writes_a_checkpoint_that_an_evaluation_reads(tmp_path, capsys):
+    path = tmp_path / "start.safetensors"
+    with pytest.raises(SystemExit) as stop:
+        main(["imitate", "--path", str(tmp_path / "start.pt")])
+    assert stop.value.code == 2 and "ends in .safetensors" in capsys.readouterr().err
+    main(
+        [
+            *("imitate", "--path", str(path), "--teacher", "hold", "--episodes", "2", "--rounds", "2"),
+            "--workers=1",
+        ]
+    )
+    card = checkpoint.load(path).card
+    assert (card.method, card.samples) == ("no_latent", 0)
