@@ -3,7 +3,6 @@
 Pure functions of the episode records; no file is written here.
 """
 
-import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -133,11 +132,6 @@ def strata_of(episodes: pd.DataFrame) -> list[str]:
 def paper_values() -> dict[str, Any]:
     text = resources.files("wbc_bench").joinpath("paper_values.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
-
-
-def slug(spec: str) -> str:
-    """A controller spec as part of a file name."""
-    return re.sub(r"[^A-Za-z0-9_.]+", "-", spec).strip("-")
 
 
 class HeightRange(NamedTuple):

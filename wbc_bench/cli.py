@@ -367,17 +367,17 @@ class ExportController:
     """Protocol whose robot it drives."""
 
     def run(self) -> None:
-        from wbc_bench.controller import Exportable, load_controller, slug
+        from wbc_bench.controller import Exportable, load_controller
         from wbc_bench.protocol import find_protocol
         from wbc_bench.robot import load_robot
-        from wbc_bench.store import ResultStore
+        from wbc_bench.store import ResultStore, folder_name
 
         robot = load_robot(find_protocol(self.protocol)[0].robot)
         controller = load_controller(self.controller, robot)
         formats = controller.formats if isinstance(controller, Exportable) else ()
         if not isinstance(controller, Exportable) or self.format not in formats:
             raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
-        path = self.out or Path(f"{slug(self.controller)}.{self.format}")
+        path = self.out or Path(f"{folder_name(self.controller)}.{self.format}")
         ResultStore(path.parent).probe()
         controller.export(path, self.format)
         print(path)

@@ -27,13 +27,13 @@ from wbc_bench.analysis import (
     column,
     paper_values,
     reach_range,
-    slug,
     stood,
     strata_of,
     subset,
     variants,
 )
 from wbc_bench.episodes import Outcome
+from wbc_bench.store import folder_name
 from wbc_bench.tables import CM, DEG, Study, methods_of
 from wbc_bench.tracking import STOOD, Track
 
@@ -314,7 +314,7 @@ def write_reach(store: StoreLike, protocol: str, out_dir: Path | str) -> list[Pa
     paths = []
     with _styled():
         for spec, method in collect(store, protocol).items():
-            paths += save(reach_figure(protocol, method), f"{protocol}_{slug(spec)}", out_dir)
+            paths += save(reach_figure(protocol, method), f"{protocol}_{folder_name(spec)}", out_dir)
     return paths
 
 
