@@ -272,12 +272,14 @@ class Report:
     """Folder of the records."""
     out: Path | None = None
     """Where to write; the folder of the records when not given."""
+    workspace: tuple[str, ...] = ()
+    """Controllers whose success over the workspace is drawn side by side; the best two when not given."""
 
     def run(self) -> None:
         from wbc_bench.publish import publish
         from wbc_bench.store import ResultStore
 
-        for path in publish(ResultStore(self.results), self.out or self.results):
+        for path in publish(ResultStore(self.results), self.out or self.results, self.workspace):
             print(path)
 
 
