@@ -23,6 +23,7 @@ Mask = NDArray[np.bool_]
 PAPER_SIGNALS = frozenset({"proprioception", "ee_pose"})  # what the paper's policy may see (its Table I)
 # Reach: the protocol's tolerance (the paper's success rule) is the rule of `reached` too.
 REACH_TOLERANCE = 0.05  # [m]
+ANGLE_TOLERANCE = float(np.radians(7.0))  # [rad] the orientation's part of the paper's success rule
 END_ZONE = 0.10  # [m] "near an end" of the range: two steps of 5 cm to either side
 
 

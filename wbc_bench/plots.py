@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 
 from wbc_bench import stats
 from wbc_bench.analysis import (
+    ANGLE_TOLERANCE,
     REACH_TOLERANCE,
     Evaluated,
     StoreLike,
@@ -132,7 +133,7 @@ def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -
     """Share of all episodes [%] that stood with an error up to x; what is missing to 100 % terminated."""
     scale, unit, tolerance = {
         "position_error": (CM, "cm", REACH_TOLERANCE * CM),
-        "orientation_error": (DEG, "deg", 7.0),  # the paper's success rule
+        "orientation_error": (DEG, "deg", ANGLE_TOLERANCE * DEG),
     }[metric]
     ticks, (left, right) = (0.5, 1, 2, 5, 10, 20, 50, 100), (0.3, 200.0)
     for k, (label, method) in enumerate(methods):

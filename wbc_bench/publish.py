@@ -38,7 +38,7 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
             for protocol in protocols:
                 _write_protocol(store, protocol, made, beside)
             _write_tracks(tracks, made)
-            report.write(store, made)
+            report.write(store, made, out)
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))
