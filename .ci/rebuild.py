@@ -1,10 +1,12 @@
 """Rebuild every table, figure and the report from the committed records, and compare byte for byte."""
 
+import shutil
 import sys
 import tempfile
 from pathlib import Path
 
 from wbc_bench.publish import publish
+from wbc_bench.report import GIVEN
 from wbc_bench.store import ResultStore
 
 
@@ -21,6 +23,10 @@ def main() -> int:
         print(f"SKIPPED: no records under {results} yet")
         return 1 if committed else 0  # tables without records are nobody's
     with tempfile.TemporaryDirectory() as folder:
+        for path in sorted(path for pattern in GIVEN for path in results.glob(pattern) if path.is_file()):
+            copy = Path(folder) / path.relative_to(results)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
         publish(store, Path(folder))
         rebuilt = products(Path(folder))
     problems = [f"not made by the records: {name}" for name in sorted(committed.keys() - rebuilt.keys())]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from wbc_bench.controller import DEPLOYABLE, SIGNALS, controllers, load_controller, slug
+from wbc_bench.controller import DEPLOYABLE, SIGNALS, controllers, load_controller
 from wbc_bench.errors import ControllerError, UnknownNameError
 from wbc_bench.robot import Robot, load_robot
 
@@ -131,16 +131,3 @@ def test_signals_that_do_not_exist(folder: Path, robot: Robot) -> None:
 
 def test_deployable_signals_exist() -> None:
     assert set(SIGNALS) > DEPLOYABLE == {"proprioception", "ee_pose"}
-
-
-@pytest.mark.parametrize(
-    ("spec", "name"),
-    [
-        ("hold", "hold"),
-        ("ik:kinematic", "ik-kinematic"),
-        ("/home/me/my ctrl.py:Mine", "home-me-my-ctrl.py-Mine"),
-        ("a@b_c.1-2", "a@b_c.1-2"),
-    ],
-)
-def test_slug(spec: str, name: str) -> None:
-    assert slug(spec) == name

@@ -3,9 +3,11 @@
 import re
 
 import pytest
+from matplotlib.figure import Figure
 from synthetic import FakeStore, reach_store, record, study_store
 
-from wbc_bench import plots, report, stats, tables
+from wbc_bench import gallery, plots, report, stats, tables
+from wbc_bench.errors import StoreError
 
 
 @pytest.fixture(autouse=True)
@@ -30,6 +32,7 @@ def test_report_holds_everything_and_loads_nothing(tmp_path):
     # Nothing is fetched: every source is inside, every link stays on the page.
     assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', text))
     assert all(link.startswith("#") for link in re.findall(r'href="([^"]*)"', text))
+    assert text.count("Worst episodes of") == 5 and "wbc-bench replay ablation_v1/ik/replicate_" in text
     assert text.count("d" * 12) >= 12 and "a" * 64 in text  # a digest a run
     before = path.read_bytes()
     assert report.write(store, tmp_path).read_bytes() == before
@@ -54,3 +57,39 @@ def test_dirty_trees_and_markup_in_records_show_as_text(tmp_path):
     text = report.write(FakeStore([dirty]), tmp_path).read_text(encoding="utf-8")
     assert "uncommitted changes" in text
     assert "<b>mine</b>" not in text and "&lt;b&gt;mine" in text and "&lt;made up&gt;" in text
+
+
+def picture(path, caption: str = "") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Figure(figsize=(1, 1)).savefig(path)
+    if caption:
+        path.with_suffix(".txt").write_text(caption, encoding="utf-8")
+
+
+def test_figures_that_no_record_makes_are_shown_with_their_captions(tmp_path):
+    made, beside = tmp_path / "made", tmp_path / "out"
+    picture(beside / "figures" / "strip_fall.png", "A <fall> in ten frames")
+    picture(beside / "figures" / "latent_a.png")
+    (beside / "figures" / "latent_a.json").write_text('{"caption": "Two clusters", "accuracy": 0.5}')
+    picture(beside / "figures" / "old_success.png")  # of an earlier report: not given, and not made now
+    text = report.write(full_store(), made, beside).read_text(encoding="utf-8")
+    assert "A &lt;fall&gt; in ten frames" in text and "Two clusters" in text and "old_success" not in text
+    assert text.index("Successive frames</h2>") < text.index("strip_fall") < text.index("Latent spaces</h2>")
+    assert text.count("<img ") == 2
+
+
+def test_a_caption_that_cannot_be_read_is_named(tmp_path):
+    picture(tmp_path / "figures" / "strip_a.png")
+    (tmp_path / "figures" / "strip_a.json").write_text('{"title": "a"}')
+    with pytest.raises(StoreError, match=r"strip_a\.png.*caption"):
+        report.write(full_store(), tmp_path)
+
+
+def test_a_replay_beside_the_report_is_linked(tmp_path):
+    frame = study_store(count=4, replicates=1).all_runs[0].frame
+    page = tmp_path / gallery.replay_path("ablation_v1", "hold", 0, int(frame["episode"].iloc[0]))
+    page.parent.mkdir(parents=True)
+    page.write_text("")
+    store = FakeStore(study_store(count=4, replicates=1).all_runs[:1])
+    text = report.write(store, tmp_path / "made", tmp_path).read_text(encoding="utf-8")
+    assert re.findall(r'<a href="(replays[^"]*)"', text) == [page.relative_to(tmp_path).as_posix()]

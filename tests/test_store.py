@@ -13,7 +13,7 @@ import pytest
 
 from wbc_bench import store as store_module
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.store import ResultStore, RunKey, RunWriter, ShardCost, write_atomic
+from wbc_bench.store import ResultStore, RunKey, RunWriter, ShardCost, folder_name, write_atomic
 
 FACTS = {
     **{"controller_name": "a", "signals": [], "source": "test", "checkpoint_sha256": None},
@@ -257,3 +257,16 @@ def test_record_round_trips(tmp_path):
     (run,) = finished(tmp_path).runs()
     again = msgspec.json.decode((run.path / "run.json").read_bytes(), type=store_module.RunRecord)
     assert again == run.record
+
+
+@pytest.mark.parametrize(
+    ("spec", "name"),
+    [
+        ("hold", "hold"),
+        ("ik:kinematic", "ik-kinematic"),
+        ("/home/me/my ctrl.py:Mine", "home-me-my-ctrl.py-Mine"),
+        ("a@b_c.1-2", "a@b_c.1-2"),
+    ],
+)
+def test_a_spec_as_a_folder_name(spec: str, name: str) -> None:
+    assert folder_name(spec) == name

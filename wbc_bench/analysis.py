@@ -3,7 +3,6 @@
 Pure functions of the episode records; no file is written here.
 """
 
-import re
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ Mask = NDArray[np.bool_]
 PAPER_SIGNALS = frozenset({"proprioception", "ee_pose"})  # what the paper's policy may see (its Table I)
 # Reach: the protocol's tolerance (the paper's success rule) is the rule of `reached` too.
 REACH_TOLERANCE = 0.05  # [m]
+ANGLE_TOLERANCE = float(np.radians(7.0))  # [rad] the orientation's part of the paper's success rule
 END_ZONE = 0.10  # [m] "near an end" of the range: two steps of 5 cm to either side
 
 
@@ -133,11 +133,6 @@ def strata_of(episodes: pd.DataFrame) -> list[str]:
 def paper_values() -> dict[str, Any]:
     text = resources.files("wbc_bench").joinpath("paper_values.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
-
-
-def slug(spec: str) -> str:
-    """A controller spec as part of a file name."""
-    return re.sub(r"[^A-Za-z0-9_.]+", "-", spec).strip("-")
 
 
 class HeightRange(NamedTuple):

@@ -272,12 +272,14 @@ class Report:
     """Folder of the records."""
     out: Path | None = None
     """Where to write; the folder of the records when not given."""
+    workspace: tuple[str, ...] = ()
+    """Controllers whose success over the workspace is drawn side by side; the best two when not given."""
 
     def run(self) -> None:
         from wbc_bench.publish import publish
         from wbc_bench.store import ResultStore
 
-        for path in publish(ResultStore(self.results), self.out or self.results):
+        for path in publish(ResultStore(self.results), self.out or self.results, self.workspace):
             print(path)
 
 
@@ -367,17 +369,17 @@ class ExportController:
     """Protocol whose robot it drives."""
 
     def run(self) -> None:
-        from wbc_bench.controller import Exportable, load_controller, slug
+        from wbc_bench.controller import Exportable, load_controller
         from wbc_bench.protocol import find_protocol
         from wbc_bench.robot import load_robot
-        from wbc_bench.store import ResultStore
+        from wbc_bench.store import ResultStore, folder_name
 
         robot = load_robot(find_protocol(self.protocol)[0].robot)
         controller = load_controller(self.controller, robot)
         formats = controller.formats if isinstance(controller, Exportable) else ()
         if not isinstance(controller, Exportable) or self.format not in formats:
             raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
-        path = self.out or Path(f"{slug(self.controller)}.{self.format}")
+        path = self.out or Path(f"{folder_name(self.controller)}.{self.format}")
         ResultStore(path.parent).probe()
         controller.export(path, self.format)
         print(path)

@@ -1,7 +1,6 @@
 """The one door through which every controller is driven, and how a controller is found by name."""
 
 import importlib
-import re
 import sys
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -193,11 +192,6 @@ def spec_of_replicate(spec: str, replicate: int) -> str:
     except ImportError as error:
         raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
     return f"{name}:{factory.of_replicate(variant, replicate)}" if isinstance(factory, PerReplicate) else spec
-
-
-def slug(spec: str) -> str:
-    """A folder name for a controller spec."""
-    return re.sub(r"[^A-Za-z0-9._@-]+", "-", spec).strip("-")
 
 
 def _load_attribute(module: str, attribute: str):

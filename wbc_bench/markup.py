@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-LONG = 30  # rows beyond which a page shows a table on demand
+LONG = 30  # rows beyond which a page shows a table on demand only
 
 
 @dataclass(frozen=True)
@@ -68,23 +68,22 @@ class Table:
         return self.data.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
     def html(self) -> str:
-        """A <table> under its title, cells escaped; `code` marks as in Markdown."""
-
-        def text(cell: str) -> str:
-            return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(cell, quote=False))
+        """A <table> that folds away under its title, cells escaped; `code` marks as in Markdown."""
 
         def line(tag: str, cells: Sequence[str], kind: str = "") -> str:
             classes = (' class="number"' if number else "" for number in self.numeric)
-            marked = (f"<{tag}{c}>{text(cell)}</{tag}>" for c, cell in zip(classes, cells, strict=True))
+            marked = (f"<{tag}{c}>{code_html(cell)}</{tag}>" for c, cell in zip(classes, cells, strict=True))
             return f"<tr{kind}>{''.join(marked)}</tr>"
 
         body = (line("td", row, ' class="group"' if row[0] else "") for row in self.rows)
-        notes = "".join(f"<li>{text(note)}</li>" for note in self.notes)
+        notes = "".join(f"<li>{code_html(note)}</li>" for note in self.notes)
         table = f'<div class="table"><table><thead>{line("th", self.header)}</thead>\n<tbody>'
         table += "\n".join(body) + "</tbody></table></div>\n"
-        if len(self.rows) > LONG:
-            table = f"<details><summary>{len(self.rows)} rows</summary>{table}</details>\n"
-        return f"<h3>{text(self.title)}</h3>\n{table}" + (f"<ul>{notes}</ul>\n" if notes else "")
+        table += f"<ul>{notes}</ul>\n" if notes else ""
+        # folded by the reader; a long one is folded already
+        long = len(self.rows) > LONG
+        title = code_html(self.title) + (f" ({len(self.rows)} rows)" if long else "")
+        return f"<details{'' if long else ' open'}><summary>{title}</summary>\n{table}</details>\n"
 
     def rich(self) -> Any:
         """For the terminal."""
@@ -115,6 +114,11 @@ def read_markdown(path: Path) -> Table:
     title = next((line.removeprefix("## ") for line in lines if line.startswith("## ")), path.stem)
     notes = tuple(line.removeprefix("- ") for line in lines if line.startswith("- "))
     return Table(path.stem, title, cells[0], tuple(cells[2:]), notes)
+
+
+def code_html(text: str) -> str:
+    """Text, escaped, with `code` marks as in Markdown."""
+    return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(text, quote=False))
 
 
 def _is_number(cell: str) -> bool:

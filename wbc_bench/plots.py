@@ -19,6 +19,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 
 from wbc_bench import stats
 from wbc_bench.analysis import (
+    ANGLE_TOLERANCE,
     REACH_TOLERANCE,
     Evaluated,
     StoreLike,
@@ -27,13 +28,13 @@ from wbc_bench.analysis import (
     column,
     paper_values,
     reach_range,
-    slug,
     stood,
     strata_of,
     subset,
     variants,
 )
 from wbc_bench.episodes import Outcome
+from wbc_bench.store import folder_name
 from wbc_bench.tables import CM, DEG, Study, methods_of
 from wbc_bench.tracking import STOOD, Track
 
@@ -77,7 +78,8 @@ def save(figure: Figure, name: str, out_dir: Path | str) -> list[Path]:
     return [png, svg]
 
 
-def _styled():
+def styled():
+    """The bench's style as a context."""
     # "default" first: a reader's own matplotlibrc must not change the figure.
     return style.context(["default", str(STYLE)])
 
@@ -131,7 +133,7 @@ def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -
     """Share of all episodes [%] that stood with an error up to x; what is missing to 100 % terminated."""
     scale, unit, tolerance = {
         "position_error": (CM, "cm", REACH_TOLERANCE * CM),
-        "orientation_error": (DEG, "deg", 7.0),  # the paper's success rule
+        "orientation_error": (DEG, "deg", ANGLE_TOLERANCE * DEG),
     }[metric]
     ticks, (left, right) = (0.5, 1, 2, 5, 10, 20, 50, 100), (0.3, 200.0)
     for k, (label, method) in enumerate(methods):
@@ -175,7 +177,7 @@ def write_study(store: StoreLike, study: Study, out_dir: Path | str) -> list[Pat
     if not methods:
         return []
     paths = []
-    with _styled():
+    with styled():
         figure = Figure(figsize=(6.4, 1.2 + 0.85 * len(methods)))
         ax = success_by_stratum(figure.subplots(), methods)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
@@ -213,16 +215,21 @@ def reach_success(ax: Axes, episodes: pd.DataFrame, label: str, colour: str) -> 
     return ax
 
 
-def reach_metric(ax: Axes, episodes: pd.DataFrame, metric: str, label: str, colour: str) -> Axes:
-    """Median and quartiles of a length or speed [cm, cm/s] at each height [cm], of episodes that stood."""
+def reach_metric(
+    ax: Axes, episodes: pd.DataFrame, metric: str, label: str, colour: str, worst: float, scale: float
+) -> Axes:
+    """Median of a metric times `scale` at each height [cm], of episodes that stood, and a band to a quantile.
+
+    The band covers what nine in ten of the episodes on the bad side of the median stay within.
+    """
     rows = []
     for height, group in by_height(episodes):
-        values = column(group, metric)[stood(group)] * CM
+        values = column(group, metric)[stood(group)] * scale
         values = values[~np.isnan(values)]
-        quartiles = np.quantile(values, [0.25, 0.5, 0.75]) if len(values) else np.full(3, np.nan)
-        rows.append((height * CM, *quartiles))
-    height, low, middle, high = np.array(rows).T
-    ax.fill_between(height, low, high, color=colour, alpha=0.18, lw=0)
+        middle, tail = np.quantile(values, [0.5, worst]) if len(values) else np.full(2, np.nan)
+        rows.append((height * CM, middle, tail))
+    height, middle, tail = np.array(rows).T
+    ax.fill_between(height, middle, tail, color=colour, alpha=0.18, lw=0)
     ax.plot(height, middle, "o-", color=colour, label=label)
     return ax
 
@@ -263,31 +270,32 @@ def _shade_beyond(ax: Axes, episodes: pd.DataFrame) -> None:
 
 
 def reach_figure(protocol: str, method: Evaluated) -> Figure:
-    """One column a gripper orientation: range, success, error and sway over height; a colour a condition."""
+    """A column a gripper orientation: range, success, error, sway over height; a colour a condition."""
     parts = variants(method.episodes)
     orientations = sorted({orientation for _, orientation, _ in parts})
-    figure = Figure(figsize=(1.6 + 3.6 * len(orientations), 7.6))
+    figure = Figure(figsize=(1.6 + 3.6 * len(orientations), 9.2))
     axes = figure.subplots(
-        4, len(orientations), sharex=True, sharey="row", squeeze=False, height_ratios=(0.75, 1, 1, 1)
+        5, len(orientations), sharex=True, sharey="row", squeeze=False, height_ratios=(0.75, 1, 1, 1, 1)
     )
     for ax_column, orientation in zip(axes.T, orientations, strict=True):
-        ranges, success, error, speed = ax_column
+        ranges, success, error, speed, smoothness = ax_column
         bars = _paper_ranges()
         for condition, episodes in ((c, e) for c, o, e in parts if o == orientation):
             colour = CONDITION_COLOURS.get(condition, GREEN)
             span = reach_range(episodes)
             bars.append((condition, span.low * CM, span.high * CM, colour))
             reach_success(success, episodes, condition, colour)
-            reach_metric(error, episodes, "position_error", condition, colour)
-            reach_metric(speed, episodes, "ee_speed_rms", condition, colour)
+            reach_metric(error, episodes, "position_error", condition, colour, 0.95, CM)
+            reach_metric(speed, episodes, "ee_speed_rms", condition, colour, 0.95, CM)
+            reach_metric(smoothness, episodes, "ee_sparc", condition, colour, 0.05, 1.0)
             for ax in ax_column[1:]:
                 _shade_beyond(ax, episodes)
         reach_bars(ranges, bars).set_title(f"Gripper {orientation}: range reached (cm)")
         error.axhline(REACH_TOLERANCE * CM, color=GREY, lw=0.9, ls="--")
-        speed.set_xlabel("Target height (cm)")
-        speed.xaxis.set_major_locator(MultipleLocator(25))
-        speed.set_xlim(-3, 203)
-    for row in axes[2:]:
+        smoothness.set_xlabel("Target height (cm)")
+        smoothness.xaxis.set_major_locator(MultipleLocator(25))
+        smoothness.set_xlim(-3, 203)
+    for row in axes[2:4]:
         # Errors beyond the arm's reach are a metre: linear where it matters, logarithmic above.
         row[0].set_yscale("symlog", linthresh=10.0, linscale=1.5)
         ticks = (0, 2, 5, 10, 20, 50, 100, 200, 500)
@@ -297,8 +305,10 @@ def reach_figure(protocol: str, method: Evaluated) -> Figure:
         row[0].yaxis.set_minor_locator(FixedLocator([]))
         row[0].yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes[1, 0].set_ylabel("Success (%)\n95 % Wilson")
-    axes[2, 0].set_ylabel("Position error (cm)\nmedian, quartiles")
-    axes[3, 0].set_ylabel("EE speed RMS (cm/s)\nmedian, quartiles")
+    axes[2, 0].set_ylabel("Position error (cm)\nmedian to P95")
+    axes[3, 0].set_ylabel("EE speed RMS (cm/s)\nmedian to P95")
+    axes[4, 0].set_ylabel("Smoothness (SPARC)\nmedian to P5")
+    figure.align_ylabels(axes[1:, 0])
     handles, labels = axes[1, 0].get_legend_handles_labels()
     if any("beyond" in set(episodes["stratum"]) for _, _, episodes in parts):
         handles, labels = [*handles, Patch(color=SHADE)], [*labels, "no feasible pose at this height"]
@@ -312,9 +322,9 @@ def reach_figure(protocol: str, method: Evaluated) -> Figure:
 def write_reach(store: StoreLike, protocol: str, out_dir: Path | str) -> list[Path]:
     """One figure a controller, straight into `out_dir`."""
     paths = []
-    with _styled():
+    with styled():
         for spec, method in collect(store, protocol).items():
-            paths += save(reach_figure(protocol, method), f"{protocol}_{slug(spec)}", out_dir)
+            paths += save(reach_figure(protocol, method), f"{protocol}_{folder_name(spec)}", out_dir)
     return paths
 
 
@@ -352,7 +362,7 @@ def write_targets(frame: pd.DataFrame, name: str, out_dir: Path | str) -> list[P
     limits["z"] = (-margin, z.max() + margin)
     width, depth, height = (limits[axis][1] - limits[axis][0] for axis in "xyz")
     scale = min(7.5 / (len(strata) * width), 5.5 / (depth + height))  # [inch/m]
-    with _styled():
+    with styled():
         size = (1.2 + len(strata) * (width * scale + 0.2), 1.5 + (depth + height) * scale)
         figure = Figure(figsize=size)
         axes = figure.subplots(
@@ -402,7 +412,7 @@ def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
     controllers = sorted({track.record.controller for track in tracks})
     colours = dict(zip(controllers, METHOD_COLOURS * len(controllers), strict=False))
     conditions = sorted({track.record.condition for track in tracks})
-    with _styled():
+    with styled():
         figure = Figure(figsize=(8.0, 0.9 + 1.45 * len(sources)))
         axes = figure.subplots(len(sources), 2, squeeze=False)
         for row, source in zip(axes, sources, strict=True):

@@ -1,36 +1,44 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 
-from wbc_bench import plots, report, tables, tracking
-from wbc_bench.errors import StoreError
+from wbc_bench import plots, report, tables, tracking, workspace
+from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.protocol import PROTOCOL_DIR, ReachTargets, load_protocol, protocol_names
 from wbc_bench.store import ResultStore
 
 
-def publish(store: ResultStore, out: Path) -> list[Path]:
+def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[Path]:
     """Write <out>/tables, <out>/figures and <out>/report.html; equal records give equal bytes.
 
-    They are made in a folder of their own and moved when all of them are there.
+    They are made in a folder of their own and moved when all of them are there. `beside` names the
+    controllers shown side by side over the workspace; the best two of each protocol otherwise.
 
-    Raises: StoreError when the store has no run, mixes digests, or the folder cannot be written.
+    Raises:
+        StoreError: the store has no run, mixes digests, or the folder cannot be written.
+        UnknownNameError: a controller named has no run under any protocol.
     """
     protocols = sorted({run.record.protocol for run in store.runs()})
     tracks = tracking.read_tracks(store.root)
     if not protocols and not tracks:
         raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
+    known = {run.record.controller for run in store.runs()}
+    for spec in beside:
+        if spec not in known:
+            raise UnknownNameError("evaluated controller", spec, known, "--workspace")
     try:
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
             made = Path(folder)
             for protocol in protocols:
-                _write_protocol(store, protocol, made)
+                _write_protocol(store, protocol, made, beside)
             _write_tracks(tracks, made)
-            report.write(store, made)
+            report.write(store, made, out)
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))
@@ -57,7 +65,7 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
     return pd.DataFrame({"target_x": x, "target_y": y, "height": height, "stratum": manifest.stratum})
 
 
-def _write_protocol(store: ResultStore, name: str, out: Path) -> None:
+def _write_protocol(store: ResultStore, name: str, out: Path, beside: Sequence[str]) -> None:
     released = load_protocol(PROTOCOL_DIR / f"{name}.toml") if name in protocol_names() else None
     if released and isinstance(released.targets, ReachTargets):
         tables.write_reach(store, name, out / "tables")
@@ -66,6 +74,8 @@ def _write_protocol(store: ResultStore, name: str, out: Path) -> None:
         study = tables.ABLATION if name == tables.ABLATION.protocol else tables.Study(name, ())
         tables.write_study(store, study, out / "tables")
         plots.write_study(store, study, out / "figures")
+        known = {run.record.controller for run in store.runs(name)}
+        workspace.write_workspace(store, study, out / "figures", [spec for spec in beside if spec in known])
     if released:
         manifest, _ = read_manifest(released, manifest_path(PROTOCOL_DIR / f"{name}.toml"))
         plots.write_targets(target_frame(manifest), name, out / "figures")

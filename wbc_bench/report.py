@@ -1,6 +1,7 @@
 """report.html: every table and figure of a results folder and where each run came from, in one file.
 
-Self-contained: style and figures are inside, nothing is loaded. The same folder gives the same bytes.
+Self-contained: style and figures are inside, nothing is loaded; links to replays beside it are all that leads
+out. The same folder gives the same bytes.
 """
 
 import base64
@@ -8,8 +9,12 @@ import html
 from pathlib import Path
 from typing import Any
 
-from wbc_bench.analysis import StoreLike
-from wbc_bench.markup import read_markdown
+import msgspec
+
+from wbc_bench import gallery
+from wbc_bench.analysis import StoreLike, collect
+from wbc_bench.errors import StoreError
+from wbc_bench.markup import code_html, read_markdown
 
 CSS = """
 :root { color-scheme: light; }
@@ -17,9 +22,10 @@ body { font: 15px/1.5 system-ui, -apple-system, "Segoe UI", "DejaVu Sans", sans-
   background: #fff; max-width: 1200px; margin: 0 auto; padding: 24px 28px 64px; }
 h1 { font-size: 26px; margin: 0 0 4px; }
 h2 { font-size: 20px; margin: 44px 0 8px; padding-bottom: 4px; border-bottom: 2px solid #0072b2; }
-h3 { font-size: 15px; margin: 28px 0 6px; }
-p.lead, nav { color: #555; }
-nav a { color: #0072b2; text-decoration: none; margin-right: 16px; }
+p.lead, p.rule, nav { color: #555; }
+p.rule { font-size: 12.5px; max-width: 960px; margin: 24px 0 0; }
+a { color: #0072b2; text-decoration: none; }
+nav a { margin-right: 16px; }
 .table { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 12px; border-top: 1.5px solid #1c1c1c;
   border-bottom: 1.5px solid #1c1c1c; font-variant-numeric: tabular-nums; }
@@ -35,22 +41,63 @@ ul { font-size: 12.5px; color: #555; margin: 8px 0 0; padding-left: 18px; max-wi
 code { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; }
 figure { margin: 20px 0; }
 figure img { max-width: 100%; height: auto; }
-figcaption { font-size: 12.5px; color: #555; }
-details { font-size: 12.5px; }
-summary { cursor: pointer; font-weight: 600; }
+figcaption { font-size: 12.5px; color: #555; max-width: 960px; }
+details { margin: 20px 0 0; }
+summary { cursor: pointer; font-weight: 600; margin: 0 0 6px; }
+.gallery td:last-child { white-space: normal; min-width: 430px; line-height: 1.25; }
+.gallery code { font-size: 10.5px; color: #555; user-select: all; }
 .tag { color: #b34a00; font-weight: 600; }
 """
 
 
-def figure_html(path: Path) -> str:
+# What is not made of records, stands beside the report and is shown in it or linked from it.
+GIVEN = ("figures/strip_*", "figures/latent_*", "replays/**/*")
+GIVEN_SECTIONS = (("strip_", "Successive frames"), ("latent_", "Latent spaces"))
+CAPTIONS = {  # end of a figure's name -> what it shows
+    "_success": "Success by stratum of the targets.",
+    "_outcomes": "How the episodes ended.",
+    "_errors": "Share of all episodes that stood with an error up to x, in the final second.",
+    "_workspace": "Targets, and where they are reached: success over bins of target positions, "
+    "projected on the vertical plane and on the ground. Faint bins hold few episodes, blank ones none.",
+    "_targets": "Targets of the protocol by stratum, from the side and from above.",
+    "tracking": "Error of the hand over time while its target moves.",
+}
+REACH_CAPTION = (
+    "Straight ahead over height: the range reached, success, and in the final second the position error and "
+    "how the hand oscillates, as speed and as smoothness (spectral arc length, 0 is smoothest)."
+)
+
+
+def figure_html(path: Path, caption: str) -> str:
     """An image as an <img> with its bytes inside; separate images, so that ids of two SVGs cannot meet."""
     kind = {".svg": "svg+xml", ".png": "png"}[path.suffix]
     data = base64.b64encode(path.read_bytes()).decode("ascii")
-    caption = html.escape(path.stem)
     return (
-        f'<figure><img alt="{caption}" src="data:image/{kind};base64,{data}">'
-        f"<figcaption>{caption}</figcaption></figure>\n"
+        f'<figure><img alt="{html.escape(path.stem)}" src="data:image/{kind};base64,{data}">'
+        f"<figcaption>{html.escape(caption)} <code>{html.escape(path.stem)}</code></figcaption></figure>\n"
     )
+
+
+def given_caption(figure: Path) -> str:
+    """What stands in <name>.txt, or as `caption` in <name>.json, beside a figure; "" without either.
+
+    Raises: StoreError, a sidecar that cannot be read.
+    """
+    text, facts = figure.with_suffix(".txt"), figure.with_suffix(".json")
+    try:
+        if text.exists():
+            return text.read_text(encoding="utf-8").strip()
+        if facts.exists():
+            return msgspec.json.decode(facts.read_bytes(), type=_Sidecar).caption
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise StoreError(f"caption of '{figure.name}': cannot read its .txt or .json: {error}") from error
+    return ""
+
+
+class _Sidecar(msgspec.Struct):
+    """A figure's .json; whatever else is in it is for others."""
+
+    caption: str
 
 
 def provenance_html(runs: list[Any]) -> str:
@@ -93,11 +140,19 @@ def _pairs(values: dict[str, Any]) -> str:
     return html.escape(", ".join(f"{key} {values[key]}" for key in sorted(values)))
 
 
-def write(store: StoreLike, results_dir: Path | str) -> Path:
-    """Writes <results_dir>/report.html from its tables/*.md, its figures and the run records of the store."""
+def write(store: StoreLike, results_dir: Path | str, beside: Path | str | None = None) -> Path:
+    """Writes <results_dir>/report.html from its tables/*.md, its figures and the run records of the store.
+
+    Replays and figures that are not made of records are looked for in `beside`, the folder where the report
+    will stand; `results_dir` when not given.
+
+    Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
+    """
     root = Path(results_dir)
+    beside = root if beside is None else Path(beside)
     tables = sorted((root / "tables").glob("*.md"))
-    figures = sorted({path.stem for path in (root / "figures").glob("*") if path.suffix in (".svg", ".png")})
+    figures = [stem for stem in _stems(root / "figures") if not _is_given(stem)]
+    given = [stem for stem in _stems(beside / "figures") if _is_given(stem)]
     runs = sorted(
         store.runs(), key=lambda run: (run.record.protocol, run.record.controller, run.record.replicate)
     )
@@ -113,10 +168,20 @@ def write(store: StoreLike, results_dir: Path | str) -> Path:
     for protocol in [*parts_of_report, ""]:
         own = sorted((path for path in tables if owner(path.stem) == protocol), key=_order)
         shown = [read_markdown(path).html() for path in own]
-        images = [figure_html(_figure(root, stem)) for stem in figures if owner(stem) == protocol]
+        images = [
+            figure_html(_figure(root, stem), _caption(stem)) for stem in figures if owner(stem) == protocol
+        ]
         parts = [*shown[:1], *images, *shown[1:]]  # what most readers came for, first
+        if protocol in protocols:
+            parts.append(f'<p class="rule">{code_html(gallery.RULE)}</p>\n')
+            evaluated = collect(store, protocol).values()
+            parts += [gallery.gallery_html(protocol, method, beside) for method in evaluated]
         if parts:
             sections.append((protocol or "More", "".join(parts)))
+    for prefix, title in GIVEN_SECTIONS:
+        own = [_figure(beside, stem) for stem in given if stem.startswith(prefix)]
+        if own:
+            sections.append((title, "".join(figure_html(path, given_caption(path)) for path in own)))
     sections.append(("Where the numbers come from", provenance_html(runs) if runs else "<p>No run yet.</p>"))
     links = "".join(f'<a href="#s{k}">{html.escape(name)}</a>' for k, (name, _) in enumerate(sections))
     body = "".join(
@@ -145,6 +210,20 @@ def _order(path: Path) -> tuple[int, str]:
     known = [k for k, suffix in enumerate(suffixes, 1) if path.stem.endswith(suffix)]
     particular = "_vs_" in path.stem or "_heights_" in path.stem
     return known[0] if known else len(suffixes) + 1 if particular else 0, path.stem
+
+
+def _stems(folder: Path) -> list[str]:
+    """Names of the figures in a folder."""
+    return sorted({path.stem for path in folder.glob("*") if path.suffix in (".svg", ".png")})
+
+
+def _is_given(stem: str) -> bool:
+    return any(stem.startswith(prefix) for prefix, _ in GIVEN_SECTIONS)
+
+
+def _caption(stem: str) -> str:
+    found = [caption for end, caption in CAPTIONS.items() if stem.endswith(end)]
+    return found[0] if found else REACH_CAPTION
 
 
 def _figure(root: Path, stem: str) -> Path:

@@ -26,7 +26,6 @@ from wbc_bench.analysis import (
     paper_values,
     reach_range,
     reached,
-    slug,
     stood,
     strata_of,
     subset,
@@ -36,6 +35,7 @@ from wbc_bench.analysis import column as series
 from wbc_bench.episodes import Outcome
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.markup import Table
+from wbc_bench.store import folder_name
 
 BOOTSTRAP_SEED = 0
 CM = 100.0  # [cm/m]
@@ -462,7 +462,7 @@ def compare_table(store: StoreLike, protocol: str, a: str, b: str) -> Table:
             raise UnknownNameError("evaluated controller", spec, evaluated, f"runs of {protocol}")
     one, two = evaluated[a], evaluated[b]
     rows = [(s, one, two, None if s == "all" else s) for s in (*strata_of(one.episodes), "all")]
-    name = f"{protocol}_{slug(a)}_vs_{slug(b)}"
+    name = f"{protocol}_{folder_name(a)}_vs_{folder_name(b)}"
     title = f"{protocol}: A = {a} against B = {b}"
     return _compare_table(name, title, "Stratum", _compare_rows(rows))
 
@@ -573,7 +573,7 @@ def height_table(protocol: str, method: Evaluated) -> Table:
         "median position error over the final 1 s of episodes that did not terminate (in brackets: how many "
         "did).",
     )
-    name, title = f"{protocol}_heights_{slug(method.spec)}", f"{protocol}: {method.spec} by height"
+    name, title = f"{protocol}_heights_{folder_name(method.spec)}", f"{protocol}: {method.spec} by height"
     return Table(name, title, ("Height (cm)", *labels), tuple(rows), notes, pd.DataFrame(data))
 
 

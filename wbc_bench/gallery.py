@@ -1,0 +1,107 @@
+"""The gallery of a report: of each controller the worst episodes of each outcome, each with its replay."""
+
+import html
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from wbc_bench.analysis import ANGLE_TOLERANCE, REACH_TOLERANCE, Evaluated, FloatArray, column, subset
+from wbc_bench.episodes import TERMINATED, Outcome
+from wbc_bench.store import folder_name
+from wbc_bench.tables import CM, DEG
+
+SHOWN = 10  # episodes an outcome
+RULE = (
+    f"At most {SHOWN} episodes of each outcome, the worst first. Of episodes that terminated, the worst "
+    "ended first; of the others, it has the largest error over the final 1 s: the position's in units of "
+    f"{REACH_TOLERANCE * CM:.0f} cm or the orientation's in units of {ANGLE_TOLERANCE * DEG:.0f}°, whichever "
+    "is more. Equals come in the order of replicate and episode. Run a command in the folder of this report; "
+    "the page it writes is linked here by the next `wbc-bench report`."
+)
+
+
+def badness(episodes: pd.DataFrame, outcome: Outcome) -> FloatArray:
+    """How bad each episode of one outcome is, (N,), by RULE; an undefined error counts as the worst."""
+    if outcome in TERMINATED:
+        return -np.nan_to_num(column(episodes, "duration"), nan=0.0)  # NaN: ended before its first step
+    position = column(episodes, "position_error") / REACH_TOLERANCE
+    orientation = column(episodes, "orientation_error") / ANGLE_TOLERANCE
+    return np.nan_to_num(np.maximum(position, orientation), nan=np.inf)
+
+
+def worst(episodes: pd.DataFrame, outcome: Outcome, count: int = SHOWN) -> pd.DataFrame:
+    """The worst episodes of an outcome, worst first."""
+    chosen = subset(episodes, np.asarray(episodes["outcome"] == str(outcome), dtype=bool))
+    order = np.lexsort((chosen["episode"], chosen["replicate"], -badness(chosen, outcome)))
+    return chosen.take(order[:count])
+
+
+def replay_path(protocol: str, controller: str, replicate: int, episode: int) -> str:
+    """Where the replay of an episode stands beside a report."""
+    return f"replays/{_run(protocol, controller, replicate)}/{episode}.html"
+
+
+def replay_command(protocol: str, controller: str, replicate: int, episode: int) -> str:
+    """What writes it, in the folder of the records and the report."""
+    run = _run(protocol, controller, replicate)
+    page = replay_path(protocol, controller, replicate, episode)
+    return f"wbc-bench replay {run} --episode {episode} --results . -o {page}"
+
+
+def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
+    """One table, folded away: a group of rows an outcome. A replay that stands in `beside` is a link."""
+    episodes = method.episodes
+    kinds = [name for name in ("condition", "orientation") if any(episodes[name])]
+    texts = ("Outcome", "Replicate", "Episode", "Stratum", *(name.capitalize() for name in kinds))
+    numbers = ("Target x (m)", "y (m)", "Height (m)", "Position error (cm)", "Orientation error (deg)")
+    outcomes = np.asarray(episodes["outcome"], dtype=str)
+    rows = []
+    for outcome in (*(each for each in Outcome if each != Outcome.SUCCESS), Outcome.SUCCESS):
+        for k, row in enumerate(worst(episodes, outcome).to_dict("records")):
+            where = (protocol, method.spec, int(row["replicate"]), int(row["episode"]))
+            count = int((outcomes == str(outcome)).sum())
+            name = f"{str(outcome).replace('_', ' ')} ({count})" if k == 0 else ""
+            cells = (
+                name,
+                str(where[2]),
+                str(where[3]),
+                str(row["stratum"]),
+                *(str(row[kind]) for kind in kinds),
+            )
+            values = (
+                *(_number(row[key], 1.0, 2) for key in ("target_x", "target_y", "height")),
+                _number(row["position_error"], CM, 1),
+                _number(row["orientation_error"], DEG, 1),
+                _number(row["duration"], 1.0, 2),
+            )
+            text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+            text += "".join(f'<td class="number">{value}</td>' for value in values)
+            text += f"<td>{_replay(where, beside)}</td>"
+            rows.append(f'<tr class="group">{text}</tr>' if k == 0 else f"<tr>{text}</tr>")
+    head = "".join(f"<th>{name}</th>" for name in texts)
+    head += (
+        "".join(f'<th class="number">{name}</th>' for name in (*numbers, "Ended at (s)")) + "<th>Replay</th>"
+    )
+    return (
+        f"<details><summary>Worst episodes of <code>{html.escape(method.spec)}</code></summary>\n"
+        f'<div class="table gallery"><table><thead><tr>{head}</tr></thead>\n<tbody>'
+        + "\n".join(rows)
+        + "</tbody></table></div></details>\n"
+    )
+
+
+def _replay(where: tuple[str, str, int, int], beside: Path) -> str:
+    path = replay_path(*where)
+    if (beside / path).is_file():
+        return f'<a href="{html.escape(path)}">watch</a>'
+    return f"<code>{html.escape(replay_command(*where))}</code>"
+
+
+def _run(protocol: str, controller: str, replicate: int) -> str:
+    """A run as `wbc-bench replay` takes it."""
+    return f"{folder_name(protocol)}/{folder_name(controller)}/replicate_{replicate}"
+
+
+def _number(value: float, scale: float, digits: int) -> str:
+    return "–" if np.isnan(value) else f"{value * scale:.{digits}f}".replace("-", "−")
