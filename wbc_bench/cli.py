@@ -239,6 +239,43 @@ class Track:
 
 
 @dataclass(frozen=True)
+class _Again:
+    name: Annotated[Positional[str], tyro.conf.arg(name="run")]
+    """Folder of a run, or <protocol>/<controller>/replicate_<k> of the records."""
+    episode: int = tyro.MISSING
+    """Number of the episode inside its replicate."""
+    results: Path = Path("results")
+    """Folder of the records."""
+    protocol: str | None = None
+    """File of the run's protocol, where that is not a released one."""
+
+    def _check_folder(self, path: Path) -> None:
+        """Before minutes are spent on what cannot be written."""
+        from wbc_bench.store import ResultStore
+
+        ResultStore(path.parent).probe()
+
+
+@dataclass(frozen=True)
+class Replay(_Again):
+    """Run one episode of a stored run again, compare it with its record, and write it as a page to watch."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("replay.html")
+    """Page to write; it needs no network."""
+
+    def run(self) -> None:
+        from wbc_bench.progress import Progress
+        from wbc_bench.store import ResultStore
+        from wbc_bench.viewer.replay import write_html
+
+        self._check_folder(self.out)
+        run = ResultStore(self.results).find(self.name)
+        with Progress("steps") as progress:
+            again = write_html(run, self.episode, self.out, self.protocol, progress.update)
+        print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}\n{self.out}")
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare two evaluated controllers on the episodes that both met."""
 
@@ -550,6 +587,7 @@ Command = (
     | Annotated[Reach, subcommand("reach")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Track, subcommand("track")]
+    | Annotated[Replay, subcommand("replay")]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Report, subcommand("report")]
     | Annotated[List, subcommand("list")]

@@ -30,7 +30,8 @@ class ControlLoop:
 
     def __init__(self, controller: Controller, protocol: EvalProtocol, rows: EpisodeManifest) -> None:
         """Raises: ControllerError when the control period is not the protocol's."""
-        period, count = protocol.control_period, len(rows)
+        self.period = period = protocol.control_period  # [s]
+        count = len(rows)
         if abs(controller.info.control_period - period) > 1e-9:
             raise ControllerError(
                 f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "

@@ -23,6 +23,7 @@ import pyarrow as pa
 
 from wbc_bench import metrics, provenance
 from wbc_bench.controller import Controller, load_controller, spec_of_replicate
+from wbc_bench.episodes import EpisodeBatch
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.progress import Progress
@@ -96,7 +97,11 @@ class Result(NamedTuple):
 def evaluate_shard(spec: str, protocol: EvalProtocol, rows: EpisodeManifest) -> pa.Table:
     """The episode record of some manifest rows: one row an episode, one column a metric."""
     controller = load_controller(spec, load_robot(protocol.robot))
-    batch = evaluate(controller, protocol, rows)
+    return episode_table(rows, evaluate(controller, protocol, rows))
+
+
+def episode_table(rows: EpisodeManifest, batch: EpisodeBatch) -> pa.Table:
+    """The record of episodes: what was asked, how they ended, and every metric."""
     columns: dict[str, Any] = {
         "replicate": rows.replicate,
         "episode": rows.episode,

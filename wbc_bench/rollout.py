@@ -1,5 +1,7 @@
 """One shard of episodes, from the manifest rows to the time series: the loop that every controller meets."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +14,15 @@ from wbc_bench.robot import NUM_JOINTS
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
 
 
-def evaluate(controller: Controller, protocol: EvalProtocol, rows: EpisodeManifest) -> EpisodeBatch:
+def evaluate(
+    controller: Controller,
+    protocol: EvalProtocol,
+    rows: EpisodeManifest,
+    watch: Callable[[ControlLoop], None] | None = None,
+) -> EpisodeBatch:
     """Run a controller through the episodes of `rows`, all on this thread.
+
+    `watch` is shown the loop at the start and after every control step; it may read all, and change nothing.
 
     Raises:
         ControllerError: the control period is not the protocol's, or a command has the wrong shape.
@@ -30,10 +39,14 @@ def evaluate(controller: Controller, protocol: EvalProtocol, rows: EpisodeManife
 
     target = loop.sensors.target(loop.state)
     loop.reset(target)
+    if watch is not None:
+        watch(loop)
     for step in range(num_steps):
         ran, q, stuck = loop.advance(target)
         if not ran.any():
             break
+        if watch is not None:
+            watch(loop)
         state = loop.state
         action[ran, step] = loop.simulation.robot.action_of(q[ran])
         if stuck is not None:

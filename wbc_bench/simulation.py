@@ -75,6 +75,7 @@ class Simulation:
         self._randomise(model)
         self._qpos, self._qvel, self._ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
+        self._subtree_com = batch.bind("subtree_com")
         self._torque, self._sensor = batch.bind("actuator_force"), batch.bind("sensordata")
         self._places = places_of(model)
         self._reset()
@@ -119,6 +120,16 @@ class Simulation:
         self._batch.step(
             None if len(ids) == len(active) else ids, nstep=self.protocol.physics.decimation, stage=_STAGE_VEL
         )
+
+    @property
+    def qpos(self) -> Array:
+        """(N, 21) base position [m], base quaternion wxyz, joints [rad]; a copy."""
+        return self._qpos.copy()
+
+    @property
+    def com_w(self) -> Array:
+        """(N, 3) [m] centre of mass of the whole robot, with the base mass of its episode; a copy."""
+        return self._subtree_com[:, 0].copy()
 
     def state(self) -> State:
         """The state now; arrays are copies or freshly computed."""

@@ -150,6 +150,17 @@ class ResultStore:
                     )
         return pd.concat([run.episodes() for run in runs], ignore_index=True)
 
+    def find(self, name: str) -> Run:
+        """A finished run by its folder, or by <protocol>/<controller>/replicate_<k> below this store.
+
+        Raises: UnknownNameError (with the nearest names), StoreError.
+        """
+        for folder in (Path(name), self.root / "runs" / name):
+            if (folder / "run.json").exists():
+                return Run(folder, _read_record(folder / "run.json"))
+        known = [str(run.path.relative_to(self.root / "runs")) for run in self.runs()]
+        raise UnknownNameError("run", name, known, f"a folder, or below '{self.root / 'runs'}'")
+
     def run_path(self, protocol: str, controller: str, replicate: int) -> Path:
         """The folder of a run."""
         folder = self.root / "runs" / folder_name(protocol) / folder_name(controller)

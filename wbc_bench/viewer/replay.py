@@ -1,0 +1,84 @@
+"""An episode as one HTML file that needs neither a server nor a network: `wbc-bench replay`."""
+
+import html
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from wbc_bench.store import Run, write_atomic
+from wbc_bench.viewer.rerun import Rerun, ShowProgress, rerun
+from wbc_bench.viewer.scene import Scene, serving
+
+EVERY = 2  # control steps a picture: 25 a second
+CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
+CHART = (400, 48)  # [px] width, height of the error chart
+
+
+def write_html(
+    run: Run,
+    episode: int,
+    path: Path,
+    protocol_name: str | None = None,
+    progress: ShowProgress | None = None,
+) -> Rerun:
+    """Run an episode of a stored run again and write it as a page with time control.
+
+    Raises: see `rerun`; BenchError without viser; StoreError when the file cannot be written.
+    """
+    again = rerun(run, episode, protocol_name, progress)
+    write_atomic(path, page(again).encode())
+    return again
+
+
+def page(again: Rerun) -> str:
+    """The page of an episode."""
+    with serving() as server:
+        scene = Scene(server, again.robot, again.protocol.success)
+        moments = again.moments[::EVERY]
+        scene.show(moments[0])
+        recording = server.get_scene_serializer()
+        for before, moment in pairwise(moments):
+            recording.insert_sleep(moment.time - before.time)
+            scene.show(moment)
+        recording.insert_sleep(1.0)  # [s] to look at the end
+        text = recording.as_html()
+    text = text.replace("<title>Viser</title>", f"<title>{html.escape(again.title)}</title>", 1)
+    body = text.rindex("</body>")
+    return text[:body] + _caption(again) + text[body:]
+
+
+def _caption(again: Rerun) -> str:
+    """What was seen, how it ended, whether the record agrees, and the errors over time."""
+    stored = again.stored
+    ends = f"{str(stored['outcome']).replace('_', ' ')} after {again.moments[-1].time:.2f} s"
+    facts = [f"<b>{html.escape(again.title)}</b>", html.escape(ends)]
+    if stored["stratum"]:
+        facts.append(f"stratum {html.escape(str(stored['stratum']))}")
+    style = "color:#1b7f4b" if not again.differences else "color:#a05a00"
+    facts.append(f'<span style="{style}">{html.escape(again.verdict)}</span>')
+    return (
+        '<div style="position:fixed;top:12px;right:12px;z-index:5;width:400px;padding:10px 14px;'
+        "background:rgba(255,255,255,.92);border:1px solid #d5d9de;border-radius:6px;color:#1b2330;"
+        f'font:13px/1.5 system-ui,sans-serif;pointer-events:none">{"<br>".join(facts)}{_chart(again)}</div>'
+    )
+
+
+def _chart(again: Rerun) -> str:
+    """Position and orientation error over time, each as a part of its largest value."""
+    time = np.array([moment.time for moment in again.moments])
+    lines, names = [], []
+    for name, unit, colour, values in (
+        ("position", "cm", "#2864c8", np.array([m.position_error for m in again.moments]) * CM),
+        ("orientation", "°", "#b0446e", np.array([m.orientation_error for m in again.moments]) * DEG),
+    ):
+        most = max(float(values.max()), 1e-9)
+        x = time / max(float(time[-1]), 1e-9) * CHART[0]
+        y = CHART[1] * (1 - values / most)
+        points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::5], y[::5], strict=True))
+        lines.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
+        names.append(f'<span style="color:{colour}">{name} error 0–{most:.1f} {unit}</span>')
+    return (
+        f'<svg width="{CHART[0]}" height="{CHART[1] + 2}" style="display:block;margin-top:6px;'
+        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>{", ".join(names)}, 0–{time[-1]:.1f} s'
+    )

@@ -1,0 +1,148 @@
+"""An episode of a stored run once more: it is deterministic, so that its record is enough to see it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from wbc_bench.control_loop import ControlLoop
+from wbc_bench.controller import load_controller, spec_of_replicate
+from wbc_bench.errors import StoreError
+from wbc_bench.execution import episode_table
+from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.protocol import EvalProtocol, find_protocol
+from wbc_bench.provenance import machine
+from wbc_bench.robot import Robot, load_robot
+from wbc_bench.rollout import evaluate
+from wbc_bench.rotations import matrix_from_wxyz
+from wbc_bench.store import Run
+from wbc_bench.viewer.moment import Moment, moment_of
+
+Row = dict[str, Any]
+ShowProgress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class Rerun:
+    """An episode as it was seen again."""
+
+    run: Run
+    protocol: EvalProtocol
+    robot: Robot
+    episode: int  # number inside the replicate
+    stored: Row  # of episodes.parquet
+    again: Row  # what the rerun measured
+    moments: list[Moment]  # (T + 1) the start, and after every control step
+
+    @property
+    def title(self) -> str:
+        """Which episode, in a few words."""
+        of = self.run.record
+        return f"{of.controller} · {of.protocol} · replicate {of.replicate} · episode {self.episode}"
+
+    @property
+    def differences(self) -> dict[str, tuple[Any, Any]]:
+        """Column -> (stored, again) of whatever is not equal to the last bit."""
+        pairs = {name: (value, self.again[name]) for name, value in self.stored.items()}
+        return {name: pair for name, pair in pairs.items() if not _same(*pair)}
+
+    @property
+    def verdict(self) -> str:
+        """One line: verified, or by how much it differs."""
+        differences = self.differences
+        if not differences:
+            return f"verified: all {len(self.stored)} recorded values are the same to the last bit"
+        there, here = self.run.record.machine.get("processor"), machine().get("processor")
+        reason = f" (recorded on {there}, this is {here})" if there != here else ""
+        changed = [f"{name} {b} (recorded {a})" for name, (a, b) in differences.items() if not _finite(a, b)]
+        changes = {
+            name: abs(b / a - 1) if a else abs(b) for name, (a, b) in differences.items() if _finite(a, b)
+        }
+        if changes:
+            worst = max(changes, key=lambda name: changes[name])
+            changed.append(f"{worst} by {changes[worst]:.1e} of its value, others less")
+        same = "another outcome" if "outcome" in differences else "the same outcome"
+        count = f"{len(differences)} of {len(self.stored)} values"
+        return f"{same}, but {count} are not the same bits{reason}: {', '.join(changed)}"
+
+
+def rerun(
+    run: Run, episode: int, protocol_name: str | None = None, progress: ShowProgress | None = None
+) -> Rerun:
+    """Run one episode of a run again, and measure it as the run did.
+
+    Alone first, which is fast: equal bits prove that it is the same episode. A controller that computes all
+    episodes of its shard at once may round otherwise alone; then its whole shard is run. Where the run comes
+    from another processor, which rounds in its own way, there are no bits to be gained by that.
+
+    `protocol_name` names the .toml file of a protocol that is not a released one.
+
+    Raises:
+        StoreError: no such episode, or the protocol or manifest is not the run's.
+        UnknownNameError, ProtocolError, ManifestError, ControllerError: what the run needs is not here.
+    """
+    record = run.record
+    protocol, path = find_protocol(protocol_name or record.protocol)
+    manifest, sha256 = read_manifest(protocol, manifest_path(path))
+    for what, here, there in (
+        ("protocol digest", protocol.digest, record.protocol_digest),
+        ("manifest sha256", sha256, record.manifest_sha256),
+    ):
+        if here != there:
+            raise StoreError(f"'{run.path}' cannot be run again: its {what} is {there}, here it is {here}")
+    rows = manifest.of_replicate(record.replicate, record.requested)
+    found = np.flatnonzero(rows.episode == episode)
+    if not len(found):
+        raise StoreError(
+            f"episode {episode} is not in '{run.path}', valid: {rows.episode.min()} to {rows.episode.max()}"
+        )
+    place = int(found[0])
+    start = place - place % record.shard_episodes
+    shard = slice(start, min(start + record.shard_episodes, len(rows)))
+    stored = run.episodes().iloc[[place]].to_dict("records")[0]
+    robot = load_robot(protocol.robot)
+    spec = spec_of_replicate(record.controller, record.replicate)
+    for part in dict.fromkeys([(place, place + 1), (shard.start, shard.stop)]):
+        chosen = rows.take(slice(*part))
+        moments, table = _watched(spec, robot, protocol, chosen, place - part[0], progress)
+        again = table.slice(place - part[0], 1).to_pylist()[0]
+        result = Rerun(run, protocol, robot, episode, stored, again, moments)
+        if not result.differences or record.machine.get("processor") != machine().get("processor"):
+            break
+    return result
+
+
+def _watched(
+    spec: str,
+    robot: Robot,
+    protocol: EvalProtocol,
+    rows: EpisodeManifest,
+    row: int,
+    progress: ShowProgress | None,
+) -> tuple[list[Moment], pa.Table]:
+    """Episodes under a controller of their own, one of them watched."""
+    pos_w, rot_w = rows.target_pos_w[row], matrix_from_wxyz(rows.target_quat_w[row])
+    push_step = np.round(rows.push_time[row] / protocol.control_period)  # NaN for none
+    push_vel = rows.push_vel[row].reshape(-1, 2)
+    moments: list[Moment] = []
+
+    def watch(loop: ControlLoop) -> None:
+        pushed = push_vel[push_step == loop.step - 1].sum(axis=0)
+        moments.append(moment_of(loop, row, pos_w, rot_w, pushed))
+        if progress is not None:
+            progress(loop.step, protocol.num_steps, "running the episode again")
+
+    batch = evaluate(load_controller(spec, robot), protocol, rows, watch)
+    seen = moments[: int(batch.steps[row]) + 1]
+    return [moment for moment in seen if np.isfinite(moment.qpos).all()], episode_table(rows, batch)
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Equal, where NaN equals NaN."""
+    return a == b or (a != a and b != b)
+
+
+def _finite(a: Any, b: Any) -> bool:
+    return isinstance(a, float) and isinstance(b, float) and bool(np.isfinite([a, b]).all())

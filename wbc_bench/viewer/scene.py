@@ -1,0 +1,222 @@
+"""The robot and what concerns its target as a viser scene; the live view and the replay draw the same one."""
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from itertools import pairwise
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from wbc_bench.errors import BenchError
+from wbc_bench.protocol import Success
+from wbc_bench.robot import Robot
+from wbc_bench.rotations import wxyz_from_matrix
+from wbc_bench.viewer.moment import TOUCHES, Moment, Skeleton
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+INSIDE, OUTSIDE = (36, 150, 90), (226, 128, 30)  # of the tolerance
+HAND, TARGET = (40, 100, 200), OUTSIDE  # trails
+GROUND, CELL, SECTION = (246, 247, 248), (222, 226, 230), (196, 202, 208)
+SUPPORT, COM, FORCE, PUSH = (90, 170, 230), (24, 36, 64), (44, 150, 150), (210, 50, 110)
+BONE_RADIUS, BONE = 0.014, (140, 148, 158)  # [m] rods between joints: the collision shapes leave gaps there
+METRES_A_NEWTON = 1 / 500  # of a force arrow
+PUSH_SECONDS, PUSH_LENGTH = 0.4, 0.6  # [s] a push stays to be seen; [m] for 1 m/s
+CHUNK = 5  # points in one piece of a trail
+NEW_POINT = 0.004  # [m] a trail grows only where something moves
+FLOOR = 0.002  # [m] above the ground, so that nothing flickers in it
+
+
+@contextmanager
+def serving(host: str = "127.0.0.1", port: int = 8080) -> Iterator[Any]:
+    """A viser server without a scene yet; on a port above, where the one asked for is taken.
+
+    Raises: BenchError when viser is missing or cannot listen.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise BenchError("this needs viser: pip install 'wbc-bench[view]'") from error
+    with redirect_stdout(io.StringIO()):  # its banner, whatever `verbose` says
+        try:
+            server = viser.ViserServer(host=host, port=port, verbose=False)
+        except OSError as error:
+            raise BenchError(f"cannot listen on {host}, port {port}: {error}") from error
+    try:
+        yield server
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+class Scene:
+    """Draws moments of one robot; `success` says when the hand is at its target."""
+
+    def __init__(self, server: Any, robot: Robot, success: Success, trail_chunks: int | None = None) -> None:
+        """`trail_chunks` is the length of the trails in pieces of CHUNK points; None keeps all of it."""
+        scene, self._success = server.scene, success
+        self.skeleton = Skeleton(robot.model())
+        scene.set_up_direction("+z")
+        # software renderers draw shadows and reflections slowly, and in stripes
+        scene.configure_default_lights(enabled=True, cast_shadow=False)
+        scene.configure_environment_map(None)
+        server.initial_camera.position, server.initial_camera.look_at = (2.0, -2.1, 1.5), (0.15, 0.0, 0.65)
+        scene.add_grid(
+            "/ground",
+            *(8.0, 8.0),
+            **{"cell_size": 0.1, "cell_color": CELL, "section_size": 0.5, "section_color": SECTION},
+            **{"section_thickness": 1.5, "plane_color": GROUND, "plane_opacity": 1.0, "shadow_opacity": 0.0},
+        )
+        self._bodies = _add_robot(scene, self.skeleton.model)
+        self._target = scene.add_frame("/target", axes_length=0.16, axes_radius=0.006, origin_radius=0.0)
+        radius = success.position
+        self._tolerance = scene.add_icosphere("/target/tolerance", radius, OUTSIDE, opacity=0.3)
+        self._hand = scene.add_frame("/hand", axes_length=0.09, axes_radius=0.004, origin_radius=0.0)
+        fan = np.array([[0, k, k + 1] for k in range(1, 7)], dtype=np.uint32)  # eight corners at most
+        flat = {"opacity": 0.45, "side": "double", "flat_shading": True}
+        self._support = scene.add_mesh_simple(
+            "/support", np.zeros((8, 3)), fan, color=SUPPORT, visible=False, **flat
+        )
+        self._com = scene.add_icosphere("/com", 0.018, COM)
+        self._forces = [
+            scene.add_arrows(f"/force_{side}", np.zeros((1, 2, 3)), FORCE, visible=False, **_arrow(0.008))
+            for side in "LR"
+        ]
+        self._push = scene.add_arrows("/push", np.zeros((1, 2, 3)), PUSH, visible=False, **_arrow(0.012))
+        self._pushed = (-np.inf, np.zeros(2))  # [s] when, [m/s]
+        self._trails = (
+            _Trail(scene, "/trail_hand", HAND, trail_chunks),
+            _Trail(scene, "/trail_target", TARGET, trail_chunks),
+        )
+
+    def clear(self) -> None:
+        """Forget what was before."""
+        self._pushed = (-np.inf, np.zeros(2))
+        for trail in self._trails:
+            trail.clear()
+
+    def show(self, moment: Moment) -> None:
+        """Draw a moment, which is later than the one before or follows a `clear`."""
+        self.skeleton.place(moment.qpos)
+        data = self.skeleton.data
+        for number, handle in self._bodies.items():
+            handle.position, handle.wxyz = data.xpos[number], data.xquat[number]
+        for handle, pos_w, rot_w in (
+            (self._target, moment.target_pos_w, moment.target_rot_w),
+            (self._hand, moment.ee_pos_w, moment.ee_rot_w),
+        ):
+            handle.position, handle.wxyz = pos_w, wxyz_from_matrix(rot_w)
+        for trail, pos_w in zip(self._trails, (moment.ee_pos_w, moment.target_pos_w), strict=True):
+            trail.add(pos_w)
+        inside = (
+            moment.position_error < self._success.position
+            and moment.orientation_error < self._success.orientation
+        )
+        self._tolerance.color = INSIDE if inside else OUTSIDE
+        self._com.position = (*moment.com_w[:2], FLOOR)
+        self._show_contacts(moment)
+        self._show_push(moment)
+
+    def _show_contacts(self, moment: Moment) -> None:
+        corners = self.skeleton.support(moment.foot_force_w)
+        self._support.visible = len(corners) > 0
+        if len(corners):
+            ring = np.concatenate([corners, np.repeat(corners[-1:], 8 - len(corners), axis=0)])
+            self._support.vertices = np.column_stack([ring, np.full(8, FLOOR)]).astype(np.float32)
+        for handle, pos_w, force_w in zip(self._forces, moment.foot_pos_w, moment.foot_force_w, strict=True):
+            handle.visible = bool(force_w[2] > TOUCHES)
+            if handle.visible:
+                handle.points = np.array([[pos_w, pos_w + force_w * METRES_A_NEWTON]], dtype=np.float32)
+
+    def _show_push(self, moment: Moment) -> None:
+        if moment.push_w.any():
+            self._pushed = moment.time, moment.push_w
+        when, velocity = self._pushed
+        self._push.visible = moment.time - when < PUSH_SECONDS
+        if self._push.visible:
+            base = moment.qpos[:3]
+            start = base - PUSH_LENGTH * np.array([*velocity, 0.0])
+            self._push.points = np.array([[start, base]], dtype=np.float32)
+
+
+class _Trail:
+    """A line in pieces, each of them sent once: what has been drawn is not sent again with every point."""
+
+    def __init__(self, scene: Any, name: str, colour: Colour, chunks: int | None) -> None:
+        self._scene, self._name, self._colour, self._chunks = scene, name, colour, chunks
+        self._handles: list[Any] = []
+        self._points: list[Array] = []
+        self._number = 0
+
+    def add(self, pos_w: Array) -> None:
+        if self._points and np.linalg.norm(pos_w - self._points[-1]) < NEW_POINT:
+            return
+        self._points.append(pos_w.copy())
+        if len(self._points) <= CHUNK:
+            return
+        points = np.array(list(pairwise(self._points)), dtype=np.float32)
+        self._points = self._points[-1:]
+        name = f"{self._name}/{self._number:06d}"
+        self._handles.append(self._scene.add_line_segments(name, points, self._colour, thickness=0.006))
+        self._number += 1
+        if self._chunks is not None and len(self._handles) > self._chunks:
+            self._handles.pop(0).remove()
+
+    def clear(self) -> None:
+        for handle in self._handles:
+            handle.remove()
+        self._handles, self._points = [], []
+
+
+def _add_robot(scene: Any, model: mujoco.MjModel) -> dict[int, Any]:
+    """Body number -> the frame that its shapes move with."""
+    bodies = {}
+    for body in range(1, model.nbody):
+        name = f"/robot/{model.body(body).name}"
+        bodies[body] = scene.add_frame(name, show_axes=False)
+        for geom in np.flatnonzero(model.geom_bodyid == body):
+            _add_geom(scene, f"{name}/{model.geom(geom).name}", model, geom)
+    for child in range(2, model.nbody):
+        parent, offset = model.body_parentid[child], model.body_pos[child]
+        length = float(np.linalg.norm(offset))
+        if length < BONE_RADIUS:
+            continue
+        quat = np.zeros(4)
+        mujoco.mju_quatZ2Vec(quat, offset)
+        name = f"/robot/{model.body(parent).name}/to_{model.body(child).name}"
+        _add_round(scene, name, length, BONE_RADIUS, True, BONE, position=offset / 2, wxyz=quat)
+    return bodies
+
+
+def _add_geom(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> None:
+    kind, size = model.geom_type[geom], model.geom_size[geom]
+    colour = tuple(int(255 * c) for c in model.geom_rgba[geom, :3])
+    pose = {"position": model.geom_pos[geom], "wxyz": model.geom_quat[geom]}
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        scene.add_box(name, colour, tuple(2 * size), **pose)
+    elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        scene.add_icosphere(name, float(size[0]), colour, subdivisions=1, **pose)
+    else:
+        round_ends = kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+        _add_round(scene, name, 2 * float(size[1]), float(size[0]), round_ends, colour, **pose)
+
+
+def _add_round(
+    scene: Any, name: str, length: float, radius: float, round_ends: bool, colour: Any, **pose: Any
+) -> None:
+    """A capsule or cylinder along z."""
+    from trimesh import creation
+
+    if round_ends:
+        mesh = creation.capsule(height=length, radius=radius, count=[20, 10])
+        scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=colour, **pose)
+    else:
+        scene.add_cylinder(name, radius, length, colour, **pose)
+
+
+def _arrow(radius: float) -> dict[str, float]:
+    return {"shaft_radius": radius, "head_radius": 2.2 * radius, "head_length": 5 * radius}
