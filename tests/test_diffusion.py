@@ -423,9 +423,9 @@ def test_a_controller_that_does_not_follow_closes_nothing(capsys, tmp_path: Path
     main([*words, "--out", str(tmp_path)])
     (run,) = read_doors(tmp_path)
     assert run.record.successes == 0 and run.record.completed == 2 and run.record.policy_sha256 is None
-    assert not run.episodes["success"].any() and run.episodes["first_closed"].isna().all()
+    assert set(run.episodes["outcome"]) <= {"fell", "illegal_contact"} and not run.episodes["success"].any()
     row = dict(zip(door_table([run]).header, door_table([run]).rows[0], strict=True))
-    assert row["Closed ↑"] == "0/2" and (tmp_path / "tables" / "doors.md").exists()
+    assert row["Closed ↑"] == "0/2" and row["Falls ↓"] == "2" and (tmp_path / "tables" / "doors.md").exists()
     beside = next(tmp_path.glob("doors/*/*/*/episodes.parquet"))
     beside.write_bytes(beside.read_bytes() + b"x")
     with pytest.raises(StoreError, match="another sha256"):
