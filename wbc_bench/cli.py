@@ -582,7 +582,7 @@ class DemoTrain:
     """File to write: POLICY.safetensors."""
     seed: int = 0
     """Of the weights, the windows and the noise."""
-    updates: int = 8000
+    updates: int = 6000
     """Steps of the optimiser."""
 
     def run(self) -> None:

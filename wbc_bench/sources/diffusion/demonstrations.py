@@ -1,4 +1,4 @@
-"""Demonstrations on disk in UMI's zarr layout; DEMONSTRATIONS.md explains it field by field."""
+"""Demonstrations on disk in UMI's zarr layout; README.md explains it field by field."""
 
 import hashlib
 import io

@@ -32,7 +32,7 @@ from wbc_bench.sources.slew import Pose
 
 Array = NDArray[np.float64]
 BATCH = 256
-UPDATES = 8000
+UPDATES = 6000
 RATE = 1e-3  # of AdamW, down to zero along a cosine
 DECAY = 0.999  # of the running mean of the weights that is kept. Source: Chi et al. 2023 keep one, too
 COPIES = 3  # of every window, each with the hand displaced
