@@ -29,6 +29,9 @@ CHAINS = (
     ("cli", "track", "sources", "protocol", "robot"),
     ("track", "control_loop", "observation"),
     ("publish", "tracking", "store"),
+    ("cli", "demo", "track", "sources"),
+    ("demo", "door_records", "store"),
+    ("publish", "door_records", "stats"),
 )
 # Numbers are made of records alone: an analysis runs where neither physics nor learning is installed.
 PURE = (
@@ -44,6 +47,7 @@ PURE = (
     "report",
     "episodes",
     "tracking",
+    "door_records",
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")
 

@@ -179,11 +179,12 @@ class Track:
     controller: tuple[str, ...] = tyro.MISSING
     """Controllers: name, name:variant, module:attribute or file.py:attribute."""
     source: tuple[str, ...] = tyro.MISSING
-    """Sources: a script of the library, a .toml file, `stream`, or `stream:SCRIPT` to send one through it."""
+    """Sources: a script of the library, a .toml file, `stream`, `stream:SCRIPT` to send one through it, or
+    `diffusion[:FILE]`, a policy in front of a door."""
     duration: float | None = None
     """Seconds; until the script ends when not given, 20 for a stream."""
     seed: int = 0
-    """Of the draws of a randomised episode."""
+    """Of the draws of a randomised episode, and of the door."""
     condition: str = "nominal"
     """nominal, or randomised: friction, mass, gains, reset state, pushes and noise of ablation_v1."""
     address: str = "tcp://127.0.0.1:5601"
@@ -198,28 +199,26 @@ class Track:
         from wbc_bench.errors import SourceError
         from wbc_bench.publish import publish_tracks
         from wbc_bench.robot import load_robot
-        from wbc_bench.sources.library import find_script, load_source
+        from wbc_bench.sources.library import check_source, load_source
         from wbc_bench.store import ResultStore
-        from wbc_bench.track import CONDITIONS, facts, track
+        from wbc_bench.track import CONDITIONS, door_protocol, facts, track
         from wbc_bench.tracking import read_tracks, tracking_table, write_track
 
         for option, given in (("--controller", self.controller), ("--source", self.source)):
             if not given:
                 raise UsageError(f"{option}: give at least one")
-        if self.seed < 0:
-            raise UsageError(f"--seed {self.seed}: valid: 0 or more")
+        _not_negative("--seed", self.seed)
         if self.condition not in CONDITIONS:
             raise UnknownNameError("condition", self.condition, CONDITIONS, "--condition")
         for name in self.source:
-            if name != "stream":
-                find_script(name.removeprefix("stream:"))
+            check_source(name)
         for spec in self.controller:
             load_controller(spec, load_robot())
         ResultStore(self.out).probe()
         for name in dict.fromkeys(self.source):
             for spec in dict.fromkeys(self.controller):
                 controller = load_controller(spec, load_robot())
-                source = load_source(name, self.address, self.allow_remote)
+                source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))
                 if self.allow_remote and source.live:
                     print(
                         f"listening on {self.address}: whoever can send there moves the robot",
@@ -362,6 +361,7 @@ class List:
         rows = [
             *((script.name, script.path.__struct_config__.tag, script.description) for script in scripts),
             ("stream", "ZeroMQ", "Targets from another program, see wbc_bench/sources/STREAM.md."),
+            ("diffusion", "policy", "Pushes a door shut, see wbc_bench/sources/diffusion/README.md."),
         ]
         _print_table(Table("sources", "Sources", ("Name", "Kind", "Description"), tuple(rows)))
         rows = [(metric.name, metric.unit, metric.better, metric.source) for metric in METRICS]
@@ -582,12 +582,145 @@ class Bench:
                 table.write(self.out)
 
 
+@dataclass(frozen=True)
+class DemoRecord:
+    """Record an expert that pushes doors shut, in UMI's zarr layout; equal options give equal bytes."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = tyro.MISSING
+    """File to write: FILE.zarr.zip."""
+    episodes: int = 100
+    """Doors."""
+    seed: int = 0
+    """Of the doors."""
+    controller: str = "ik"
+    """Controller that the expert drives."""
+    workers: int = field(default_factory=_cores)
+    """Processes; the file does not depend on it."""
+
+    def run(self) -> None:
+        from wbc_bench.demo import record
+        from wbc_bench.progress import Progress
+        from wbc_bench.store import ResultStore
+
+        _at_least_one("--episodes", self.episodes)
+        _at_least_one("--workers", self.workers)
+        _not_negative("--seed", self.seed)
+        ResultStore(self.out.parent).probe()
+        with Progress("episodes") as progress:
+            kept = record(self.out, self.controller, self.seed, self.episodes, self.workers, progress.update)
+        print(f"{self.out}: {kept} of {self.episodes} episodes closed their door and are kept")
+
+
+@dataclass(frozen=True)
+class DemoTrain:
+    """Train a diffusion policy on demonstrations; a few minutes on one core."""
+
+    demonstrations: Positional[Path]
+    """File that `demo record` wrote."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = tyro.MISSING
+    """File to write: POLICY.safetensors."""
+    seed: int = 0
+    """Of the weights, the windows and the noise."""
+    updates: int = 6000
+    """Steps of the optimiser."""
+
+    def run(self) -> None:
+        import time
+
+        from wbc_bench.errors import SourceError
+        from wbc_bench.progress import Progress
+        from wbc_bench.store import ResultStore
+
+        try:
+            from wbc_bench.sources.diffusion.policy import save_policy
+            from wbc_bench.sources.diffusion.training import train
+        except ImportError as error:
+            raise SourceError(
+                "training needs torch and safetensors: pip install 'wbc-bench[diffusion]'"
+            ) from error
+
+        _at_least_one("--updates", self.updates)
+        _not_negative("--seed", self.seed)
+        ResultStore(self.out.parent).probe()
+        start = time.monotonic()
+        with Progress("updates") as progress:
+            policy, card = train(
+                self.demonstrations,
+                self.seed,
+                self.updates,
+                lambda update, loss: progress.update(update + 1, self.updates, f"loss {loss:.4f}"),
+            )
+        save_policy(self.out, policy, card)
+        took = time.monotonic() - start
+        print(
+            f"{self.out}: {card.demonstrations} demonstrations, {card.samples} windows, "
+            f"{card.steps} updates in {took:.0f} s"
+        )
+
+
+@dataclass(frozen=True)
+class DemoEval:
+    """Let a policy, or the expert, drive a controller in front of doors, and count the closed ones."""
+
+    policy: Positional[Path | None] = None
+    """File that `demo train` wrote; the packaged policy when not given."""
+    controller: str = "ik"
+    """Controller: name, name:variant, module:attribute or file.py:attribute."""
+    expert: FlagCreatePairsOff[bool] = False
+    """The scripted expert instead of a policy."""
+    episodes: int = 50
+    """Doors."""
+    seed: int = 1
+    """Of the doors and the policy's noise; not that of the demonstrations."""
+    condition: str = "nominal"
+    """nominal, or randomised: friction, mass, gains, reset state, pushes and noise of ablation_v1."""
+    workers: int = field(default_factory=_cores)
+    """Processes; the results do not depend on it."""
+    out: Path = Path("results")
+    """Folder of the record and the table."""
+
+    def run(self) -> None:
+        from wbc_bench.demo import evaluate
+        from wbc_bench.door_records import door_table, read_doors
+        from wbc_bench.progress import Progress
+        from wbc_bench.publish import publish_doors
+        from wbc_bench.track import CONDITIONS
+
+        _at_least_one("--episodes", self.episodes)
+        _at_least_one("--workers", self.workers)
+        _not_negative("--seed", self.seed)
+        if self.condition not in CONDITIONS:
+            raise UnknownNameError("condition", self.condition, CONDITIONS, "--condition")
+        if self.expert and self.policy:
+            raise UsageError(f"--expert and '{self.policy}': give one of them")
+        with Progress("episodes") as progress:
+            evaluate(
+                self.out,
+                None if self.expert else str(self.policy or ""),
+                self.controller,
+                self.condition,
+                self.seed,
+                self.episodes,
+                self.workers,
+                progress.update,
+            )
+        publish_doors(self.out, self.out)
+        _print_table(door_table(read_doors(self.out)))
+        print(f"record and table are under {self.out}")
+
+
 Command = (
     Annotated[Ablation, subcommand("ablation")]
     | Annotated[Reach, subcommand("reach")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Track, subcommand("track")]
     | Annotated[Replay, subcommand("replay")]
+    | Annotated[
+        Annotated[DemoRecord, subcommand("record")]
+        | Annotated[DemoTrain, subcommand("train")]
+        | Annotated[DemoEval, subcommand("eval")],
+        subcommand("demo", description="Record, learn and score the pushing of doors."),
+    ]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Report, subcommand("report")]
     | Annotated[List, subcommand("list")]
@@ -609,6 +742,11 @@ Command = (
 def _at_least_one(option: str, value: int) -> None:
     if value < 1:
         raise UsageError(f"{option} {value}: valid: 1 or more")
+
+
+def _not_negative(option: str, value: int) -> None:
+    if value < 0:
+        raise UsageError(f"{option} {value}: valid: 0 or more")
 
 
 def _within(option: str, value: int | None, most: int, what: str) -> int:

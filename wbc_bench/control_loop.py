@@ -11,7 +11,7 @@ from wbc_bench.errors import ControllerError
 from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.observation import Sensors
 from wbc_bench.protocol import EvalProtocol
-from wbc_bench.robot import NUM_JOINTS
+from wbc_bench.robot import NUM_JOINTS, Scene
 from wbc_bench.simulation import Simulation, State
 
 RUNNING = ""
@@ -28,7 +28,13 @@ class Taken(NamedTuple):
 class ControlLoop:
     """Observe, act, push, step, and end what has fallen. `state` and `observation` are the present ones."""
 
-    def __init__(self, controller: Controller, protocol: EvalProtocol, rows: EpisodeManifest) -> None:
+    def __init__(
+        self,
+        controller: Controller,
+        protocol: EvalProtocol,
+        rows: EpisodeManifest,
+        scene: Scene | None = None,
+    ) -> None:
         """Raises: ControllerError when the control period is not the protocol's."""
         self.period = period = protocol.control_period  # [s]
         count = len(rows)
@@ -40,7 +46,7 @@ class ControlLoop:
         if isinstance(controller, ProtocolAware):
             controller.prepare(protocol)
         self._controller, self._protocol, self._rows = controller, protocol, rows
-        self.simulation = Simulation(protocol, rows)
+        self.simulation = Simulation(protocol, rows, scene)
         self.sensors = Sensors(protocol, rows, controller.info.signals)
         self._push_step = np.full(rows.push_time.shape, -1)
         planned = np.isfinite(rows.push_time)

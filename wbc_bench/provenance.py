@@ -17,7 +17,7 @@ SOURCE_SUFFIXES = (".py", ".toml")
 BYSTANDERS = frozenset(
     {"protocols", "paper_values", "freeze", "cli", "__main__", "publish", "report", "tables", "plots"}
     | {"markup", "analysis", "stats", "store", "progress", "provenance"}
-    | {"sources", "track", "tracking"}
+    | {"sources", "track", "tracking", "demo", "door_records"}
 )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from wbc_bench import plots, report, tables, tracking, workspace
+from wbc_bench import door_records, plots, report, tables, tracking, workspace
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.protocol import PROTOCOL_DIR, ReachTargets, load_protocol, protocol_names
@@ -25,7 +25,8 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
     """
     protocols = sorted({run.record.protocol for run in store.runs()})
     tracks = tracking.read_tracks(store.root)
-    if not protocols and not tracks:
+    doors = door_records.read_doors(store.root)
+    if not protocols and not tracks and not doors:
         raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
     known = {run.record.controller for run in store.runs()}
     for spec in beside:
@@ -38,6 +39,7 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
             for protocol in protocols:
                 _write_protocol(store, protocol, made, beside)
             _write_tracks(tracks, made)
+            _write_doors(doors, made)
             report.write(store, made, out)
             return [
                 _move(path, out / path.relative_to(made))
@@ -55,6 +57,17 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
     """
     try:
         return _write_tracks(tracking.read_tracks(root), out)
+    except OSError as error:
+        raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
+
+
+def publish_doors(root: Path, out: Path) -> list[Path]:
+    """Write the table of the doors under `root` alone.
+
+    Raises: StoreError when a run cannot be read or the folder cannot be written.
+    """
+    try:
+        return _write_doors(door_records.read_doors(root), out)
     except OSError as error:
         raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
 
@@ -86,6 +99,10 @@ def _write_tracks(tracks: list[tracking.Track], out: Path) -> list[Path]:
         return []
     paths = tracking.tracking_table(tracks).write(out / "tables")
     return paths + plots.write_tracking(tracks, out / "figures")
+
+
+def _write_doors(runs: list[door_records.DoorRun], out: Path) -> list[Path]:
+    return door_records.door_table(runs).write(out / "tables") if runs else []
 
 
 def _move(source: Path, destination: Path) -> Path:

@@ -159,7 +159,7 @@ def write(store: StoreLike, results_dir: Path | str, beside: Path | str | None =
     # A section a protocol: its files begin with its name, and the longest such name owns a file.
     protocols = sorted({run.record.protocol for run in runs})
 
-    parts_of_report = [*protocols, "tracking"]
+    parts_of_report = [*protocols, "tracking", "doors"]
 
     def owner(stem: str) -> str:
         return max((p for p in parts_of_report if stem == p or stem.startswith(f"{p}_")), key=len, default="")

@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.protocol import EvalProtocol
-from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Scene, load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 
 Array = NDArray[np.float64]
+_JOINTS = slice(7, 7 + NUM_JOINTS)  # of the robot in qpos; what a scene adds follows
+_JOINT_SPEEDS = slice(6, 6 + NUM_JOINTS)
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
 MAX_SPEED = 1e3  # [m/s, rad/s] of any coordinate; beyond it the integration has diverged
 # on these MuJoCo resets the simulation or zeroes its controls, and goes on as if nothing had happened
@@ -65,13 +67,14 @@ class State(NamedTuple):
 class Simulation:
     """N episodes of one protocol, on one thread. Rows that have ended are not stepped further."""
 
-    def __init__(self, protocol: EvalProtocol, rows: EpisodeManifest) -> None:
+    def __init__(self, protocol: EvalProtocol, rows: EpisodeManifest, scene: Scene | None = None) -> None:
         self.protocol, self.rows = protocol, rows
         self.robot = load_robot(protocol.robot)
-        model = self.robot.model(protocol.physics.timestep)
+        model = self.robot.model(protocol.physics.timestep, scene)
         count = len(rows)
         # persistent: sensors refreshed after a step are not computed again by the next
         self._batch = batch = Batch(model, count, nthread=1, persistent=True)
+        self._base = model.body(self.robot.facts.base).id
         self._randomise(model)
         self._qpos, self._qvel, self._ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
@@ -85,7 +88,7 @@ class Simulation:
         rows, batch = self.rows, self._batch
         # the larger coefficient of a pair counts, so both sides carry the draw
         batch.expand("geom_friction")[:, :, 0] = rows.friction[:, None]
-        base = model.body(self.robot.facts.base).id
+        base = self._base
         mass = model.body_mass[base]
         batch.expand("body_mass")[:, base] = mass + rows.base_mass
         batch.expand("body_inertia")[:, base] = (
@@ -102,7 +105,7 @@ class Simulation:
         self._batch.reset(stage=_STAGE_NONE)
         qpos[:, :7] = 0.0
         qpos[:, 2], qpos[:, 3] = rows.base_height, 1.0
-        qpos[:, 7:] = self.robot.default_q
+        qpos[:, _JOINTS] = self.robot.default_q
         qpos[:, 7 : 7 + NUM_LEG_JOINTS] += rows.leg_q
         qvel[:, :6] = rows.base_vel
         qvel[:, 6 : 6 + NUM_LEG_JOINTS] = rows.leg_qd
@@ -124,12 +127,17 @@ class Simulation:
     @property
     def qpos(self) -> Array:
         """(N, 21) base position [m], base quaternion wxyz, joints [rad]; a copy."""
-        return self._qpos.copy()
+        return self._qpos[:, : _JOINTS.stop].copy()
 
     @property
     def com_w(self) -> Array:
         """(N, 3) [m] centre of mass of the whole robot, with the base mass of its episode; a copy."""
-        return self._subtree_com[:, 0].copy()
+        return self._subtree_com[:, self._base].copy()
+
+    @property
+    def scenery(self) -> Array:
+        """Positions (N, K) of the joints that a scene added; K is 0 without one."""
+        return self._qpos[:, _JOINTS.stop :].copy()
 
     def state(self) -> State:
         """The state now; arrays are copies or freshly computed."""
@@ -141,8 +149,8 @@ class Simulation:
             base_rot_w=matrix_from_wxyz(qpos[:, 3:7]),
             base_lin_vel_w=qvel[:, :3],
             base_ang_vel_b=qvel[:, 3:6],
-            joint_pos=qpos[:, 7:],
-            joint_vel=qvel[:, 6:],
+            joint_pos=qpos[:, _JOINTS],
+            joint_vel=qvel[:, _JOINT_SPEEDS],
             joint_torque=self._torque.copy(),
             ee_pos_w=self._site_xpos[:, at.tcp].copy(),
             ee_rot_w=self._site_xmat[:, at.tcp].reshape(-1, 3, 3).copy(),

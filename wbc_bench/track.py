@@ -2,10 +2,13 @@
 
 import math
 import time as clocks
+from collections.abc import Callable
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from wbc_bench import provenance
 from wbc_bench.control_loop import RUNNING, ControlLoop
@@ -18,11 +21,12 @@ from wbc_bench.randomization import draw, undisturbed
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.rotations import geodesic_angle
 from wbc_bench.simulation import Simulation, State
-from wbc_bench.sources.interface import Seen, Source, to_world
+from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
 from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import ScriptedSource
 from wbc_bench.tracking import STOOD, Tracked
 
+Array = NDArray[np.float64]
 CONDITIONS = ("nominal", "randomised")
 BASE_PROTOCOL = "ablation_v1"  # whose physics, randomisation, noise, pushes and limits hold
 UNSCRIPTED = 20.0  # [s] for a source that has no end
@@ -51,31 +55,55 @@ def track(
     return follow(controller, source, protocol, _row(protocol, condition)), duration
 
 
-def follow(controller: Controller, source: Source, protocol: EvalProtocol, row: EpisodeManifest) -> Tracked:
-    """The series of one episode (a manifest of one row, whose target nobody looks at)."""
+class Moment(NamedTuple):
+    """One control step as a source met it."""
+
+    seen: Seen
+    target_pos_w: Array  # (3,) [m]
+    target_rot_w: Array  # (3, 3)
+    scenery: Array  # (K,) positions of the joints that the source's scene added
+
+
+def follow(
+    controller: Controller,
+    source: Source,
+    protocol: EvalProtocol,
+    row: EpisodeManifest,
+    watch: Callable[[Moment], None] = lambda moment: None,
+) -> Tracked:
+    """The series of one episode (a manifest of one row, whose target nobody looks at).
+
+    `watch` is told of every control step that was taken.
+    """
     period = protocol.control_period
-    loop = ControlLoop(controller, protocol, row)
+    furnished = source if isinstance(source, SceneSource) else None
+    loop = ControlLoop(controller, protocol, row, furnished.scene if furnished else None)
     robot = loop.simulation.robot
-    seen = seen_of(loop.state, robot)
+    seen, scenery = seen_of(loop.state, robot), loop.simulation.scenery[0]
+    if furnished:
+        furnished.look(scenery)
     source.reset(seen)
     target_pos_w, ee_pos_w, position, orientation = [], [], [], []
     start = clocks.monotonic()
     for step in range(protocol.num_steps):
         if source.live:
             clocks.sleep(max(0.0, start + step * period - clocks.monotonic()))
+        if furnished:
+            furnished.look(scenery)
         pos_w, rot_w = to_world(source.target(step * period, seen), seen)
         target = target_in_base(loop.state, pos_w[None], rot_w[None])
         if step == 0:
             loop.reset(target)
         if not loop.advance(target).ran.any():
             break
+        watch(Moment(seen, pos_w, rot_w, scenery))
         target_pos_w.append(pos_w)
         ee_pos_w.append(seen.ee_pos_w)
         position.append(np.linalg.norm(seen.ee_pos_w - pos_w))
         orientation.append(geodesic_angle(seen.ee_rot_w, rot_w))
         if not loop.active.any():
             break
-        seen = seen_of(loop.state, robot)
+        seen, scenery = seen_of(loop.state, robot), loop.simulation.scenery[0]
     ended = loop.ended[0]
     return Tracked(
         control_period=period,
@@ -98,6 +126,11 @@ def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
     )
 
 
+def door_protocol(seed: int) -> EvalProtocol:
+    """The protocol whose robot a source's doors are drawn for, with the seed of an episode."""
+    return _protocol(UNSCRIPTED, seed)
+
+
 def natural_duration(source: Source) -> float:
     """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources."""
     script = source.script if isinstance(source, ScriptedSource | PlayedStream) else None
@@ -110,12 +143,19 @@ def natural_duration(source: Source) -> float:
     return math.ceil(played.path.duration + STAY)
 
 
+def _digest(source: Source) -> str | None:
+    """SHA-256 of the script or the policy that decides the targets."""
+    if isinstance(source, ScriptedSource | PlayedStream):
+        return source.script.digest
+    return source.digest if isinstance(source, SceneSource) else None
+
+
 def facts(controller: Controller, spec: str, source: Source, condition: str, seed: int) -> dict:
     """What the record of a run says beside its series."""
     commit = provenance.commit()
     return {
         "source": source.name,
-        "source_sha256": source.script.digest if isinstance(source, ScriptedSource | PlayedStream) else None,
+        "source_sha256": _digest(source),
         "controller": spec,
         "signals": sorted(controller.info.signals),
         "condition": condition,
@@ -130,6 +170,14 @@ def facts(controller: Controller, spec: str, source: Source, condition: str, see
     }
 
 
+def episode_of(
+    duration: float, seed: int, condition: str, episode: int = 0
+) -> tuple[EvalProtocol, EpisodeManifest]:
+    """An episode of `duration` [s] without a target, and the protocol it is of."""
+    protocol = _protocol(duration, seed)
+    return protocol, _row(protocol, condition, episode)
+
+
 def _protocol(duration: float, seed: int) -> EvalProtocol:
     protocol, _ = find_protocol(BASE_PROTOCOL)
     episodes = msgspec.structs.replace(
@@ -138,13 +186,13 @@ def _protocol(duration: float, seed: int) -> EvalProtocol:
     return msgspec.structs.replace(protocol, name="track", episodes=episodes)
 
 
-def _row(protocol: EvalProtocol, condition: str) -> EpisodeManifest:
-    draws = (draw if condition == "randomised" else undisturbed)(protocol, 0, 0)
+def _row(protocol: EvalProtocol, condition: str, episode: int = 0) -> EpisodeManifest:
+    draws = (draw if condition == "randomised" else undisturbed)(protocol, 0, episode)
     columns = {name: np.array([value]) for name, value in draws._asdict().items()}
     labels = {name: np.array([""], dtype=object) for name in ("stratum", "orientation")}
     return EpisodeManifest(
         replicate=np.zeros(1, dtype=np.int64),
-        episode=np.zeros(1, dtype=np.int64),
+        episode=np.full(1, episode, dtype=np.int64),
         condition=np.array([condition], dtype=object),
         height=np.full(1, np.nan),
         target_pos_w=np.full((1, 3), np.nan),

@@ -120,7 +120,7 @@ class TrackRecord(msgspec.Struct, frozen=True, kw_only=True):
     """What was run, and where the series beside it come from."""
 
     source: str
-    source_sha256: str | None  # of a script; a stream or a person has none
+    source_sha256: str | None  # of a script or a policy; a stream or a person has none
     controller: str  # the spec as it was given
     signals: list[str]
     condition: str

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from wbc_bench.robot.facts import Facts, RobotConfig, effort_of, gain_of, load_facts, mount_of, tcp_of
 from wbc_bench.robot.mjcf import build_model, build_spec
+from wbc_bench.robot.scene import Scene
 from wbc_bench.robot.urdf import build_urdf
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "Facts",
     "Robot",
     "RobotConfig",
+    "Scene",
     "build_model",
     "build_spec",
     "build_urdf",
@@ -48,9 +50,9 @@ class Robot:
     kd: NDArray[np.float64]  # (14,) [N m s/rad]
     armature: NDArray[np.float64]  # (14,) [kg m^2]
 
-    def model(self, timestep: float = 0.002) -> mujoco.MjModel:
-        """The MuJoCo model."""
-        return build_model(self.facts, self.config, timestep)
+    def model(self, timestep: float = 0.002, scene: Scene | None = None) -> mujoco.MjModel:
+        """The MuJoCo model, in a scene if one is given."""
+        return build_model(self.facts, self.config, timestep, scene)
 
     def urdf(self) -> str:
         """The URDF text."""

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 
 from wbc_bench.robot.facts import Facts, Geom, Link, RobotConfig, effort_of, gain_of, mount_of, tcp_of
+from wbc_bench.robot.scene import Scene
 
 GROUND = 1  # collision bits: what may touch the ground,
 BODY = 2  # and what may touch other parts of the robot
@@ -98,9 +99,14 @@ def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mu
     return spec
 
 
-def build_model(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mujoco.MjModel:
-    """The compiled model of `build_spec`."""
-    return build_spec(facts, config, timestep).compile()
+def build_model(
+    facts: Facts, config: RobotConfig, timestep: float = 0.002, scene: Scene | None = None
+) -> mujoco.MjModel:
+    """The compiled model of `build_spec`, in a scene if one is given."""
+    spec = build_spec(facts, config, timestep)
+    if scene is not None:
+        scene.furnish(spec)
+    return spec.compile()
 
 
 def _add_surroundings(spec: mujoco.MjSpec) -> None:

@@ -1,17 +1,18 @@
 """What every source of targets has in common.
 
 A source is asked once a control step: time and what there is to be seen go in, a stamped 6-DoF target comes
-out. A source that needs more of its scene than `Seen` holds (a door, a camera) is given it when it is built.
+out. A source that acts on more than the robot (a door) brings its scene along, see `SceneSource`.
 """
 
 import math
 from collections.abc import Mapping
-from typing import Literal, NamedTuple, Protocol, get_args
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.errors import SourceError
+from wbc_bench.robot import Scene
 from wbc_bench.rotations import matrix_from_wxyz
 
 Array = NDArray[np.float64]
@@ -60,6 +61,18 @@ class Source(Protocol):
 
     def close(self) -> None:
         """Let go of sockets and threads."""
+        ...
+
+
+@runtime_checkable
+class SceneSource(Source, Protocol):
+    """A source whose targets only make sense in a scene of its own."""
+
+    scene: Scene
+    digest: str | None  # SHA-256 of what decides the targets; None where that is code alone
+
+    def look(self, scenery: Array) -> None:
+        """Positions (K,) of the joints that the scene added, before `reset` and before every `target`."""
         ...
 
 

@@ -1,15 +1,20 @@
 """A source by its name."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from wbc_bench.errors import UnknownNameError
-from wbc_bench.protocol import PROTOCOL_DIR
+from wbc_bench.errors import SourceError, UnknownNameError
+from wbc_bench.protocol import PROTOCOL_DIR, EvalProtocol, find_protocol
 from wbc_bench.sources.interface import Source
 from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
 
+if TYPE_CHECKING:
+    from wbc_bench.sources.diffusion.policy import Card, Policy
+
 SOURCE_DIR = PROTOCOL_DIR / "sources"
+POLICY = Path(__file__).parent / "diffusion" / "door.safetensors"  # of `diffusion` without a file
 
 
 def script_names() -> list[str]:
@@ -19,7 +24,7 @@ def script_names() -> list[str]:
 
 def source_names() -> list[str]:
     """Everything that `load_source` knows by name."""
-    return [*script_names(), "stream"]
+    return [*script_names(), "stream", "diffusion"]
 
 
 def find_script(name: str) -> Script:
@@ -34,14 +39,54 @@ def find_script(name: str) -> Script:
     return load_script(SOURCE_DIR / f"{name}.toml")
 
 
-def load_source(name: str, address: str = ADDRESS, allow_remote: bool = False) -> Source:
-    """The source of a name: `stream`, a script of the library or of a .toml file, or `stream:SCRIPT`.
+def check_source(name: str) -> None:
+    """Whether `load_source` knows a name, without opening anything.
 
     Raises: UnknownNameError (with the nearest names), SourceError.
     """
+    if _is_diffusion(name):
+        find_policy(name.partition(":")[2])
+    elif name != "stream":
+        find_script(name.removeprefix("stream:"))
+
+
+def load_source(
+    name: str, address: str = ADDRESS, allow_remote: bool = False, protocol: EvalProtocol | None = None
+) -> Source:
+    """The source of a name: `stream`, a script of the library or of a .toml file, `stream:SCRIPT`, or
+    `diffusion[:FILE]`, which stands in front of the first door of the protocol's seed.
+
+    Raises: UnknownNameError (with the nearest names), SourceError.
+    """
+    if _is_diffusion(name):
+        from wbc_bench.sources.diffusion.scene import draw_door
+        from wbc_bench.sources.diffusion.source import DiffusionSource
+
+        policy, _, digest = find_policy(name.partition(":")[2])
+        protocol = protocol or find_protocol("ablation_v1")[0]
+        seed = protocol.episodes.seed
+        return DiffusionSource(policy, draw_door(protocol, seed, 0), seed, digest)
     if name == "stream":
         return StreamSource(address, allow_remote=allow_remote)
     if name.startswith("stream:"):
         script = ScriptedSource(find_script(name.removeprefix("stream:")))
         return PlayedStream(script, StreamSource(address, allow_remote=allow_remote))
     return ScriptedSource(find_script(name))
+
+
+def find_policy(file: str = "") -> "tuple[Policy, Card, str]":
+    """The diffusion policy of a file, by default the packaged one, its card and its SHA-256.
+
+    Raises: SourceError when the file is missing or damaged, or torch or safetensors is not installed.
+    """
+    try:
+        from wbc_bench.sources.diffusion.policy import load_policy
+    except ImportError as error:
+        raise SourceError(
+            "a diffusion policy needs torch and safetensors: pip install 'wbc-bench[diffusion]'"
+        ) from error
+    return load_policy(Path(file) if file else POLICY)
+
+
+def _is_diffusion(name: str) -> bool:
+    return name.partition(":")[0] == "diffusion"

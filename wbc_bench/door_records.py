@@ -1,0 +1,154 @@
+"""What pushing doors shut leaves behind: a row an episode, a record of the run, and the table of them.
+
+<root>/doors/<source>/<controller>/<condition>_<seed>/run.json, episodes.parquet
+"""
+
+import hashlib
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from wbc_bench import stats
+from wbc_bench.errors import StoreError
+from wbc_bench.markup import Table
+from wbc_bench.store import folder_name, write_atomic
+from wbc_bench.tracking import STOOD
+
+DEG = 180.0 / np.pi  # [deg/rad]
+NONE = "–"
+
+
+class DoorRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """What was run, and where the episodes beside it come from."""
+
+    source: str
+    policy_sha256: str | None  # of the policy's file; the expert has none
+    controller: str  # the spec as it was given
+    signals: list[str]
+    condition: str
+    seed: int  # of the doors
+    requested: int
+    completed: int
+    successes: int
+    duration: float  # [s] of an episode
+    closed_below: float  # [rad]
+    episodes_sha256: str  # of episodes.parquet
+    software_sha256: str
+    git_commit: str | None
+    git_dirty: bool
+    versions: dict[str, str]
+    machine: dict[str, str | int | float]
+    created: str  # UTC, ISO 8601
+
+
+class DoorRun(NamedTuple):
+    """A run on disk."""
+
+    record: DoorRecord
+    episodes: pd.DataFrame
+
+
+def write_doors(root: Path, episodes: pd.DataFrame, **facts) -> Path:
+    """Write a run, replacing an earlier one of the same source, controller, condition and seed.
+
+    Args: episodes with x, y, z [m], yaw, angle, final_angle [rad], first_closed [s], outcome, success, steps.
+
+    Raises: StoreError when the folder cannot be written.
+    """
+    sink = pa.BufferOutputStream()
+    table = pa.Table.from_pandas(episodes, preserve_index=False).replace_schema_metadata()
+    pq.write_table(table, sink, compression="zstd", use_dictionary=False)
+    data = sink.getvalue().to_pybytes()
+    record = DoorRecord(
+        completed=len(episodes),
+        successes=int(episodes["success"].sum()),
+        episodes_sha256=hashlib.sha256(data).hexdigest(),
+        **facts,
+    )
+    name = f"{record.condition}_{record.seed}"
+    folder = root / "doors" / folder_name(record.source) / folder_name(record.controller) / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot create '{folder}': {error.strerror}") from error
+    write_atomic(folder / "episodes.parquet", data)
+    write_atomic(folder / "run.json", msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
+    return folder
+
+
+def read_doors(root: Path) -> list[DoorRun]:
+    """Every run under a folder, sorted by controller, condition, seed and source.
+
+    Raises: StoreError when one cannot be read or its episodes are not those it was written with.
+    """
+    runs = [_read(path) for path in root.glob("doors/*/*/*/run.json")]
+    return sorted(
+        runs,
+        key=lambda run: (run.record.controller, run.record.condition, run.record.seed, run.record.source),
+    )
+
+
+def _read(path: Path) -> DoorRun:
+    beside = path.with_name("episodes.parquet")
+    try:
+        record = msgspec.json.decode(path.read_bytes(), type=DoorRecord)
+        data = beside.read_bytes()
+    except (OSError, msgspec.MsgspecError) as error:
+        raise StoreError(f"cannot read run '{path}': {error}") from error
+    if hashlib.sha256(data).hexdigest() != record.episodes_sha256:
+        raise StoreError(f"'{beside}' is not what its run.json was written for: another sha256")
+    return DoorRun(record, pq.read_table(pa.BufferReader(data)).to_pandas())
+
+
+def door_table(runs: list[DoorRun]) -> Table:
+    """A row a run."""
+    rows, data = [], []
+    for record, episodes in runs:
+        rate = stats.wilson(record.successes, record.completed)
+        stood = episodes["outcome"] == STOOD
+        final = episodes["final_angle"][stood] * DEG
+        took = episodes["first_closed"][episodes["success"]]
+        digest = record.policy_sha256
+        rows.append(
+            (
+                f"{record.source} `{digest[:12]}`" if digest else record.source,
+                f"`{record.controller}`",
+                record.condition,
+                str(record.seed),
+                f"{record.successes}/{record.completed}",
+                f"{rate.low * 100:.1f} to {rate.high * 100:.1f}",
+                str(int((~stood).sum())),
+                *(_cell(value, 1) for value in (final.median(), final.max(), took.median())),
+            )
+        )
+        data.append(
+            {"source": record.source, "policy_sha256": digest or "", "controller": record.controller}
+            | {"condition": record.condition, "seed": record.seed, "requested": record.requested}
+            | {"completed": record.completed, "successes": record.successes, "rate": rate.point}
+            | {"wilson_low": rate.low, "wilson_high": rate.high, "falls": int((~stood).sum())}
+            | {"final_angle_median_deg": final.median(), "final_angle_max_deg": final.max()}
+            | {"first_closed_median_s": took.median()}
+        )
+    header = (
+        *("Source", "Controller", "Condition", "Doors of seed", "Closed ↑", "95 % interval (%)", "Falls ↓"),
+        *("Final angle, median ↓ (deg)", "Largest ↓ (deg)", "Closed after (s)"),
+    )
+    notes = [
+        "The hand pushes a cabinet door shut; the same doors for every row of a seed. `Closed`: the door is "
+        "closed at the end and the robot stands, of the doors tried; interval: Wilson. Angles are of "
+        "episodes that ended standing; `Closed after`: median over the doors that stayed closed.",
+    ]
+    notes += [
+        f"A door counts as closed below {angle * DEG:.1f} degrees; an episode lasts {duration:g} s."
+        for angle, duration in sorted({(run.record.closed_below, run.record.duration) for run in runs})
+    ]
+    return Table("doors", "Doors pushed shut", header, tuple(rows), tuple(notes), pd.DataFrame(data))
+
+
+def _cell(value: float, digits: int) -> str:
+    return NONE if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")

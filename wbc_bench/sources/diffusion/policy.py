@@ -1,0 +1,133 @@
+"""A trained policy: from two looks at hand and door to a chunk of hand poses, and the file it is kept in."""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load as tensors_of
+from safetensors.torch import save as bytes_of
+from torch import Tensor, nn
+
+from wbc_bench.errors import SourceError
+from wbc_bench.sources.diffusion import poses
+from wbc_bench.sources.diffusion.demonstrations import DOOR
+from wbc_bench.sources.diffusion.denoising import Denoiser, sample
+from wbc_bench.sources.slew import Pose
+from wbc_bench.store import write_atomic
+
+Array = NDArray[np.float64]
+FORMAT = 1
+PERIOD = 0.1  # [s] between two poses of a chunk, and between the two looks
+HORIZON = 16  # poses of a chunk
+LOOKS = 2  # the one before, and now
+ACTION = poses.POSE + 1  # a pose and the gripper's width
+LOOK = poses.POSE + 1 + DOOR  # the hand as seen from where it is now, the gripper's width, the door
+HIDDEN = 224  # the largest whose file stays below a megabyte
+CARD = "card"  # the one entry of the file's metadata: the order of several is not determined
+
+
+class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a policy is and where it comes from."""
+
+    format: int
+    seed: int
+    demonstrations: int
+    demonstrations_seed: int | None  # of their doors
+    demonstrations_sha256: str
+    samples: int  # windows of the demonstrations
+    steps: int  # of the optimiser
+    batch: int
+    hidden: int
+    git_commit: str | None
+    git_dirty: bool
+    torch: str  # version
+
+
+class Policy(nn.Module):
+    """Normalisers and network; ranges of every number of a look and of every step's action."""
+
+    def __init__(self, hidden: int = HIDDEN) -> None:
+        super().__init__()
+        self.denoiser = Denoiser(HORIZON * ACTION, LOOKS * LOOK, hidden)
+        for name, shape in (("look", (LOOKS * LOOK,)), ("action", (HORIZON * ACTION,))):
+            self.register_buffer(f"{name}_middle", torch.zeros(shape))
+            self.register_buffer(f"{name}_half", torch.ones(shape))
+
+    def look(self, looks: Tensor) -> Tensor:
+        """Looks (B, LOOKS * LOOK) to about [-1, 1]."""
+        return (looks - self.look_middle) / self.look_half
+
+    def action(self, chunk: Tensor) -> Tensor:
+        """Chunks (B, HORIZON * ACTION) to [-1, 1]."""
+        return (chunk - self.action_middle) / self.action_half
+
+    def chunk(self, looks: Tensor, noise: Tensor) -> Tensor:
+        """Chunks (B, HORIZON, ACTION) of looks (B, LOOKS * LOOK), from noise (B, HORIZON * ACTION)."""
+        with torch.no_grad():
+            found = sample(self.denoiser, noise, self.look(looks))
+            return (found * self.action_half + self.action_middle).reshape(-1, HORIZON, ACTION)
+
+
+def look(before: Pose, now: Pose, width: float, door_before: Array, door_now: Array) -> Array:
+    """What the policy sees, (LOOKS * LOOK,): hand poses in UMI's tool frame, doors as `door_state`."""
+    views = [
+        np.concatenate([poses.numbers(poses.relative(hand, now)), [width], door])
+        for hand, door in ((before, door_before), (now, door_now))
+    ]
+    return np.concatenate(views)
+
+
+def save_policy(path: Path, policy: Policy, card: Card) -> None:
+    """Write one safetensors file with the card in its metadata. Raises: StoreError."""
+    tensors = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
+    write_atomic(path, bytes_of(tensors, metadata={CARD: msgspec.json.encode(card).decode()}))
+
+
+def load_policy(path: Path) -> tuple[Policy, Card, str]:
+    """A policy, its card and the SHA-256 of its file.
+
+    Raises: SourceError when the file is missing, damaged, no policy, or of another format or size.
+    """
+    card = read_card(path)
+    data = path.read_bytes()
+    policy = Policy(card.hidden)
+    tensors, wanted = tensors_of(data), policy.state_dict()
+    shapes: dict[str, Any] = {name: tuple(value.shape) for name, value in tensors.items()}
+    for name, value in wanted.items():
+        if shapes.get(name) != tuple(value.shape):
+            raise SourceError(
+                f"policy '{path}': tensor {name} is {shapes.get(name, 'missing')}, "
+                f"valid: {tuple(value.shape)}"
+            )
+        if not tensors[name].isfinite().all():
+            raise SourceError(f"policy '{path}': tensor {name} holds a number that is not finite")
+    policy.load_state_dict(tensors)
+    return policy.eval(), card, hashlib.sha256(data).hexdigest()
+
+
+def read_card(path: Path) -> Card:
+    """The card of a policy's file. Raises: SourceError."""
+    if not path.is_file():
+        raise SourceError(f"policy '{path}' does not exist")
+    try:
+        with safe_open(path, framework="pt") as file:
+            text = (file.metadata() or {}).get(CARD)
+    except (OSError, SafetensorError) as error:
+        raise SourceError(f"policy '{path}' is damaged, valid: a safetensors file: {error}") from error
+    if text is None:
+        raise SourceError(f"policy '{path}' has no card in its metadata: it is of another program")
+    try:
+        card = msgspec.json.decode(text, type=Card)
+    except msgspec.DecodeError as error:
+        raise SourceError(f"policy '{path}': card: {error}") from error
+    if card.format != FORMAT or not 1 <= card.hidden <= 1 << 12:
+        raise SourceError(
+            f"policy '{path}': format {card.format} with {card.hidden} hidden units, "
+            f"valid: {FORMAT} with 1 to 4096"
+        )
+    return card
