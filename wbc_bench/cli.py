@@ -275,6 +275,46 @@ class Replay(_Again):
 
 
 @dataclass(frozen=True)
+class Film(_Again):
+    """Run one episode of a stored run again and film it, or draw successive pictures of it side by side."""
+
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Film to write (.mp4)."""
+    strip: Path | None = None
+    """Strip of pictures to write (.png)."""
+    times: tuple[float, ...] | None = None
+    """Seconds of the pictures of a strip; six, evenly over the episode, when not given."""
+
+    def run(self) -> None:
+        from matplotlib import image
+
+        from wbc_bench.progress import Progress
+        from wbc_bench.store import ResultStore
+        from wbc_bench.viewer.film import strip_of, write_film_of
+        from wbc_bench.viewer.rerun import rerun
+
+        if self.out is None and self.strip is None:
+            raise UsageError("nothing to write: give -o FILE.mp4, --strip FILE.png or both")
+        for path, suffix in ((self.out, ".mp4"), (self.strip, ".png")):
+            if path and path.suffix != suffix:
+                raise UsageError(f"'{path}': valid: a file that ends in {suffix}")
+            if path:
+                self._check_folder(path)
+        run = ResultStore(self.results).find(self.name)
+        with Progress("steps") as progress:
+            again = rerun(run, self.episode, self.protocol, progress.update)
+        print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}")
+        if self.out:
+            with Progress("pictures") as progress:
+                write_film_of(again, self.out, progress.update)
+            print(self.out)
+        if self.strip:
+            pixels = strip_of(again, self.times)
+            image.imsave(self.strip, pixels, format="png", pil_kwargs={"pnginfo": None})
+            print(self.strip)
+
+
+@dataclass(frozen=True)
 class Compare:
     """Compare two evaluated controllers on the episodes that both met."""
 
@@ -715,6 +755,7 @@ Command = (
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Track, subcommand("track")]
     | Annotated[Replay, subcommand("replay")]
+    | Annotated[Film, subcommand("film")]
     | Annotated[
         Annotated[DemoRecord, subcommand("record")]
         | Annotated[DemoTrain, subcommand("train")]

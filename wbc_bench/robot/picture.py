@@ -42,40 +42,53 @@ def render(robot: Robot, path: Path, q: Array | None = None, size: tuple[int, in
     mujoco.mjv_updateScene(
         model, data, mujoco.MjvOption(), None, camera, mujoco.mjtCatBit.mjCAT_ALL.value, scene
     )
-    _add_bones(scene, model, data)
-    _add_axes(scene, data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3))
+    add_bones(scene, model, data)
+    add_axes(scene, data.site("tcp").xpos, data.site("tcp").xmat.reshape(3, 3))
     scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0  # software renderers draw them in stripes
 
     # no text in the file: equal pictures are equal bytes
-    image.imsave(path, _draw(model, scene, width, height), format="png", pil_kwargs={"pnginfo": None})
+    with Canvas(model, width, height) as canvas:
+        image.imsave(path, canvas.draw(scene), format="png", pil_kwargs={"pnginfo": None})
 
 
-def _draw(model: mujoco.MjModel, scene: mujoco.MjvScene, width: int, height: int) -> NDArray[np.uint8]:
-    """The scene in pixels (height, width, 3), by EGL where there is no display and no MUJOCO_GL."""
-    chosen = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
-    try:
-        if sys.platform == "linux" and not chosen:
-            # MuJoCo chose its own backend when it was imported, too early to ask for this one
-            from mujoco.egl import GLContext
-        else:
-            from mujoco.gl_context import GLContext
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # GLFW warns of the missing display, and goes on
-            window = GLContext(width, height)
-            window.make_current()
-            context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-    except Exception as error:  # each backend fails in its own way: missing library, driver, display
-        raise BenchError(
-            f"no OpenGL on this machine to draw with ({error}): install EGL or OSMesa and set MUJOCO_GL "
-            "to egl or osmesa"
-        ) from error
-    pixels, viewport = np.empty((height, width, 3), dtype=np.uint8), mujoco.MjrRect(0, 0, width, height)
-    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
-    mujoco.mjr_render(viewport, scene, context)
-    mujoco.mjr_readPixels(pixels, None, viewport, context)
-    context.free()
-    window.free()
-    return pixels[::-1]  # OpenGL counts rows from below
+class Canvas:
+    """Draws scenes of one model without a window, by EGL where there is no display and no MUJOCO_GL."""
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+        """Raises: BenchError when this machine cannot draw without a window."""
+        chosen = any(os.environ.get(name) for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"))
+        try:
+            if sys.platform == "linux" and not chosen:
+                # MuJoCo chose its own backend when it was imported, too early to ask for this one
+                from mujoco.egl import GLContext
+            else:
+                from mujoco.gl_context import GLContext
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # GLFW warns of the missing display, and goes on
+                self._window = GLContext(width, height)
+                self._window.make_current()
+                self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except Exception as error:  # each backend fails in its own way: missing library, driver, display
+            raise BenchError(
+                f"no OpenGL on this machine to draw with ({error}): install EGL or OSMesa and set MUJOCO_GL "
+                "to egl or osmesa"
+            ) from error
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+
+    def __enter__(self) -> "Canvas":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._context.free()
+        self._window.free()
+
+    def draw(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
+        """The scene in pixels (height, width, 3)."""
+        pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
+        mujoco.mjr_render(self._viewport, scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
+        return pixels[::-1]  # OpenGL counts rows from below
 
 
 def _stand(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData, q: Array) -> None:
@@ -95,23 +108,25 @@ def _extent(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
     return (centre - radius).min(axis=0), (centre + radius).max(axis=0)
 
 
-def _add_bones(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def add_bones(scene: mujoco.MjvScene, model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Rods between joints: the collision shapes leave gaps there."""
     for child in range(2, model.nbody):
         parent = model.body_parentid[child]
         kind = mujoco.mjtGeom.mjGEOM_CAPSULE
-        _add_connector(scene, kind, BONE_RADIUS, data.xpos[parent], data.xpos[child], BONE_COLOUR)
+        add_connector(scene, kind, BONE_RADIUS, data.xpos[parent], data.xpos[child], BONE_COLOUR)
 
 
-def _add_axes(scene: mujoco.MjvScene, origin: Array, rot_w: Array) -> None:
+def add_axes(scene: mujoco.MjvScene, origin: Array, rot_w: Array) -> None:
+    """A frame (3,) [m], (3, 3) as three arrows."""
     for axis, colour in zip(rot_w.T, AXIS_COLOURS, strict=True):
         kind = mujoco.mjtGeom.mjGEOM_ARROW
-        _add_connector(scene, kind, AXIS_RADIUS, origin, origin + AXIS_LENGTH * axis, colour)
+        add_connector(scene, kind, AXIS_RADIUS, origin, origin + AXIS_LENGTH * axis, colour)
 
 
-def _add_connector(
+def add_connector(
     scene: mujoco.MjvScene, kind: mujoco.mjtGeom, radius: float, start: Array, end: Array, colour
-):
+) -> None:
+    """A shape of a radius [m] between two points (3,) [m], its colour RGBA."""
     geom = scene.geoms[scene.ngeom]
     rgba = np.array(colour, dtype=np.float32)
     mujoco.mjv_initGeom(geom, kind.value, np.zeros(3), np.zeros(3), np.zeros(9), rgba)

@@ -10,6 +10,8 @@ from wbc_bench.control_loop import ControlLoop
 from wbc_bench.rotations import geodesic_angle
 
 Array = NDArray[np.float64]
+PUSH_SECONDS = 0.4  # [s] that a push stays to be seen
+METRES_A_NEWTON, SECONDS_OF_PUSH = 1 / 500, 0.6  # lengths of arrows: [m/N], [m] a [m/s]
 TOUCHES = 1.0  # [N] of a sole that stands; less is the noise of the contact solver
 
 
@@ -25,7 +27,7 @@ class Moment(NamedTuple):
     com_w: Array  # (3,) [m] centre of mass
     foot_pos_w: Array  # (2, 3) [m] left and right sole
     foot_force_w: Array  # (2, 3) [N] ground on left and right sole
-    push_w: Array  # (2,) [m/s] velocity that a push has just added to the base; zero without one
+    push_w: Array  # (2,) [m/s] what a push of the last PUSH_SECONDS added to the base's velocity, or zero
 
     @property
     def position_error(self) -> float:
@@ -53,6 +55,21 @@ def moment_of(loop: ControlLoop, row: int, pos_w: Array, rot_w: Array, push_w: A
         foot_force_w=state.foot_force_w[row],
         push_w=push_w,
     )
+
+
+def force_arrows(moment: Moment) -> list[tuple[Array, Array]]:
+    """From a sole to the tip of the ground's force on it, (3,) [m] each, of the soles that stand."""
+    return [
+        (pos_w, pos_w + METRES_A_NEWTON * force_w)
+        for pos_w, force_w in zip(moment.foot_pos_w, moment.foot_force_w, strict=True)
+        if force_w[2] > TOUCHES
+    ]
+
+
+def push_arrow(moment: Moment) -> tuple[Array, Array] | None:
+    """An arrow (3,), (3,) [m] that ends at the base, while a push is to be seen."""
+    base = moment.qpos[:3]
+    return (base - SECONDS_OF_PUSH * np.array([*moment.push_w, 0.0]), base) if moment.push_w.any() else None
 
 
 class Skeleton:

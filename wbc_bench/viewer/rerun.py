@@ -18,7 +18,7 @@ from wbc_bench.robot import Robot, load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz
 from wbc_bench.store import Run
-from wbc_bench.viewer.moment import Moment, moment_of
+from wbc_bench.viewer.moment import PUSH_SECONDS, Moment, moment_of
 
 Row = dict[str, Any]
 ShowProgress = Callable[[int, int, str], None]
@@ -124,12 +124,13 @@ def _watched(
 ) -> tuple[list[Moment], pa.Table]:
     """Episodes under a controller of their own, one of them watched."""
     pos_w, rot_w = rows.target_pos_w[row], matrix_from_wxyz(rows.target_quat_w[row])
-    push_step = np.round(rows.push_time[row] / protocol.control_period)  # NaN for none
+    push_time = rows.push_time[row]  # [s] NaN for none
     push_vel = rows.push_vel[row].reshape(-1, 2)
     moments: list[Moment] = []
 
     def watch(loop: ControlLoop) -> None:
-        pushed = push_vel[push_step == loop.step - 1].sum(axis=0)
+        since = loop.step * loop.period - push_time  # [s]
+        pushed = push_vel[(since > 0) & (since <= PUSH_SECONDS)].sum(axis=0)
         moments.append(moment_of(loop, row, pos_w, rot_w, pushed))
         if progress is not None:
             progress(loop.step, protocol.num_steps, "running the episode again")

@@ -14,7 +14,7 @@ from wbc_bench.errors import BenchError
 from wbc_bench.protocol import Success
 from wbc_bench.robot import Robot
 from wbc_bench.rotations import wxyz_from_matrix
-from wbc_bench.viewer.moment import TOUCHES, Moment, Skeleton
+from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -24,8 +24,6 @@ HAND, TARGET = (40, 100, 200), OUTSIDE  # trails
 GROUND, CELL, SECTION = (246, 247, 248), (222, 226, 230), (196, 202, 208)
 SUPPORT, COM, FORCE, PUSH = (90, 170, 230), (24, 36, 64), (44, 150, 150), (210, 50, 110)
 BONE_RADIUS, BONE = 0.014, (140, 148, 158)  # [m] rods between joints: the collision shapes leave gaps there
-METRES_A_NEWTON = 1 / 500  # of a force arrow
-PUSH_SECONDS, PUSH_LENGTH = 0.4, 0.6  # [s] a push stays to be seen; [m] for 1 m/s
 CHUNK = 5  # points in one piece of a trail
 NEW_POINT = 0.004  # [m] a trail grows only where something moves
 FLOOR = 0.002  # [m] above the ground, so that nothing flickers in it
@@ -82,12 +80,8 @@ class Scene:
             "/support", np.zeros((8, 3)), fan, color=SUPPORT, visible=False, **flat
         )
         self._com = scene.add_icosphere("/com", 0.018, COM)
-        self._forces = [
-            scene.add_arrows(f"/force_{side}", np.zeros((1, 2, 3)), FORCE, visible=False, **_arrow(0.008))
-            for side in "LR"
-        ]
-        self._push = scene.add_arrows("/push", np.zeros((1, 2, 3)), PUSH, visible=False, **_arrow(0.012))
-        self._pushed = (-np.inf, np.zeros(2))  # [s] when, [m/s]
+        self._forces = [_add_arrow(scene, f"/force_{k}", FORCE, 0.008) for k in range(2)]
+        self._push = [_add_arrow(scene, "/push", PUSH, 0.012)]
         self._trails = (
             _Trail(scene, "/trail_hand", HAND, trail_chunks),
             _Trail(scene, "/trail_target", TARGET, trail_chunks),
@@ -95,7 +89,6 @@ class Scene:
 
     def clear(self) -> None:
         """Forget what was before."""
-        self._pushed = (-np.inf, np.zeros(2))
         for trail in self._trails:
             trail.clear()
 
@@ -119,7 +112,6 @@ class Scene:
         self._tolerance.color = INSIDE if inside else OUTSIDE
         self._com.position = (*moment.com_w[:2], FLOOR)
         self._show_contacts(moment)
-        self._show_push(moment)
 
     def _show_contacts(self, moment: Moment) -> None:
         corners = self.skeleton.support(moment.foot_force_w)
@@ -127,20 +119,9 @@ class Scene:
         if len(corners):
             ring = np.concatenate([corners, np.repeat(corners[-1:], 8 - len(corners), axis=0)])
             self._support.vertices = np.column_stack([ring, np.full(8, FLOOR)]).astype(np.float32)
-        for handle, pos_w, force_w in zip(self._forces, moment.foot_pos_w, moment.foot_force_w, strict=True):
-            handle.visible = bool(force_w[2] > TOUCHES)
-            if handle.visible:
-                handle.points = np.array([[pos_w, pos_w + force_w * METRES_A_NEWTON]], dtype=np.float32)
-
-    def _show_push(self, moment: Moment) -> None:
-        if moment.push_w.any():
-            self._pushed = moment.time, moment.push_w
-        when, velocity = self._pushed
-        self._push.visible = moment.time - when < PUSH_SECONDS
-        if self._push.visible:
-            base = moment.qpos[:3]
-            start = base - PUSH_LENGTH * np.array([*velocity, 0.0])
-            self._push.points = np.array([[start, base]], dtype=np.float32)
+        push = push_arrow(moment)
+        _place_arrows(self._forces, force_arrows(moment))
+        _place_arrows(self._push, [push] if push else [])
 
 
 class _Trail:
@@ -218,5 +199,13 @@ def _add_round(
         scene.add_cylinder(name, radius, length, colour, **pose)
 
 
-def _arrow(radius: float) -> dict[str, float]:
-    return {"shaft_radius": radius, "head_radius": 2.2 * radius, "head_length": 5 * radius}
+def _add_arrow(scene: Any, name: str, colour: Colour, radius: float) -> Any:
+    sizes = {"shaft_radius": radius, "head_radius": 2.2 * radius, "head_length": 5 * radius}
+    return scene.add_arrows(name, np.zeros((1, 2, 3)), colour, visible=False, **sizes)
+
+
+def _place_arrows(handles: list[Any], arrows: list[tuple[Array, Array]]) -> None:
+    for k, handle in enumerate(handles):
+        handle.visible = k < len(arrows)
+        if handle.visible:
+            handle.points = np.array([arrows[k]], dtype=np.float32)

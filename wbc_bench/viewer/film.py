@@ -1,0 +1,211 @@
+"""An episode as a film or as a strip of pictures, drawn without a window: `wbc-bench film`."""
+
+import os
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from wbc_bench.errors import BenchError, StoreError
+from wbc_bench.robot.picture import Canvas, add_axes, add_bones, add_connector
+from wbc_bench.store import Run
+from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
+from wbc_bench.viewer.rerun import Rerun, ShowProgress, rerun
+
+Pixels = NDArray[np.uint8]
+EVERY = 2  # control steps a picture: 25 a second, in real time
+SIZE, PANEL = (640, 480), (300, 400)  # [px] width, height of a film, of a picture in a strip
+PANELS, GAP = 6, 4  # pictures in a strip; [px] between them
+CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
+INSIDE, OUTSIDE = (0.14, 0.59, 0.35, 0.4), (0.89, 0.50, 0.12, 0.4)  # of the tolerance, around the target
+TRAIL, FORCE, PUSH = (0.16, 0.39, 0.78, 1.0), (0.17, 0.59, 0.59, 1.0), (0.82, 0.20, 0.43, 1.0)
+SUPPORT, COM = (0.35, 0.67, 0.90, 1.0), (0.09, 0.14, 0.25, 1.0)
+TRAIL_PIECES = 50  # at most, evenly over the past
+INK = (27, 35, 48)
+AZIMUTH, ELEVATION = 218.0, -14.0  # [deg]
+MARGIN = 0.22  # [m] around what must be seen: half the width of a part, and the labels
+
+
+def write_film(
+    run: Run,
+    episode: int,
+    path: Path,
+    protocol_name: str | None = None,
+    progress: ShowProgress | None = None,
+) -> Rerun:
+    """Run an episode of a stored run again and write it as MP4, in real time.
+
+    Raises: see `rerun`; BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
+    """
+    again = rerun(run, episode, protocol_name, progress)
+    write_film_of(again, path, progress)
+    return again
+
+
+def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None) -> None:
+    """The film of an episode that has been run again."""
+    try:
+        from imageio_ffmpeg import write_frames
+    except ImportError as error:
+        raise BenchError("a film needs imageio-ffmpeg: pip install 'wbc-bench[film]'") from error
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp.mp4")
+    rate = 1 / (EVERY * again.protocol.control_period)  # [1/s]
+    shown = range(0, len(again.moments), EVERY)
+    try:
+        with Camera(again, SIZE) as camera:
+            writer = write_frames(str(part), SIZE, fps=rate, quality=7, ffmpeg_log_level="error")
+            writer.send(None)
+            for number, k in enumerate(shown, 1):
+                writer.send(camera.picture(k, again.title))
+                if progress is not None:
+                    progress(number, len(shown), "filming")
+            writer.close()
+        part.replace(path)
+    except OSError as error:
+        raise StoreError(f"cannot write '{path}': {error}") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def strip(
+    run: Run,
+    episode: int,
+    times: Sequence[float] | None = None,
+    protocol_name: str | None = None,
+    progress: ShowProgress | None = None,
+) -> Pixels:
+    """Pictures side by side, (400, W, 3), at `times` [s]; by default six, evenly from the start to the end.
+
+    Raises: see `rerun`; BenchError without OpenGL.
+    """
+    return strip_of(rerun(run, episode, protocol_name, progress), times)
+
+
+def strip_of(again: Rerun, times: Sequence[float] | None = None) -> Pixels:
+    """The strip of an episode that has been run again; a time beyond its end shows its end."""
+    clock = np.array([moment.time for moment in again.moments])
+    if times is None:
+        times = np.linspace(0.0, clock[-1], PANELS).tolist()
+    with Camera(again, PANEL, samples=4) as camera:
+        pictures = [camera.picture(int(np.abs(clock - time).argmin())) for time in times]
+    gap = np.full((PANEL[1], GAP, 3), 255, dtype=np.uint8)
+    return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
+
+
+class Camera:
+    """Stands still, where it sees the whole episode."""
+
+    def __init__(self, again: Rerun, size: tuple[int, int], samples: int = 0) -> None:
+        """`size` in pixels (width, height), `samples` a pixel against jagged edges.
+
+        Raises: BenchError when this machine cannot draw.
+        """
+        self._again = again
+        model = again.robot.model()
+        model.vis.global_.offwidth, model.vis.global_.offheight = size
+        quality = model.vis.quality  # is what a processor that draws spends its time on
+        quality.offsamples, quality.numslices, quality.numstacks = samples, 16, 8
+        self._skeleton = Skeleton(model)
+        self._scene = mujoco.MjvScene(model, maxgeom=500)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0  # and draw shadows in stripes
+        half = np.tan(np.deg2rad(model.vis.global_.fovy) / 2)  # [1] height at unit distance
+        self._view = _view(again.moments, np.array([half * size[0] / size[1], half]))
+        self._canvas = Canvas(model, *size)
+
+    def __enter__(self) -> "Camera":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._canvas.__exit__()
+
+    def picture(self, k: int, title: str = "") -> Pixels:
+        """The k-th moment, and the way to it, in pixels (height, width, 3)."""
+        moment, scene, skeleton = self._again.moments[k], self._scene, self._skeleton
+        skeleton.place(moment.qpos)
+        mujoco.mj_comPos(skeleton.model, skeleton.data)
+        mujoco.mj_camlight(skeleton.model, skeleton.data)
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(
+            skeleton.model, skeleton.data, mujoco.MjvOption(), None, self._view, every, scene
+        )
+        add_bones(scene, skeleton.model, skeleton.data)
+        self._add_target(moment)
+        self._add_contacts(moment)
+        past = self._again.moments[: k + 1]
+        line = [m.ee_pos_w for m in past[:: -(-len(past) // TRAIL_PIECES)]] + [moment.ee_pos_w]
+        for start, end in pairwise(line):
+            add_connector(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.004, start, end, TRAIL)
+        return _label(self._canvas.draw(scene), moment, title)
+
+    def _add_target(self, moment: Moment) -> None:
+        success = self._again.protocol.success
+        inside = moment.position_error < success.position and moment.orientation_error < success.orientation
+        add_axes(self._scene, moment.target_pos_w, moment.target_rot_w)
+        _add_ball(self._scene, moment.target_pos_w, success.position, INSIDE if inside else OUTSIDE)
+
+    def _add_contacts(self, moment: Moment) -> None:
+        arrow, scene = mujoco.mjtGeom.mjGEOM_ARROW, self._scene
+        corners = self._skeleton.support(moment.foot_force_w)
+        ring = np.column_stack([corners, np.full(len(corners), 0.003)])
+        for start, end in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            add_connector(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.004, start, end, SUPPORT)
+        _add_ball(scene, np.array([*moment.com_w[:2], 0.003]), 0.014, COM)
+        for start, end in force_arrows(moment):
+            add_connector(scene, arrow, 0.010, start, end, FORCE)
+        if push := push_arrow(moment):
+            add_connector(scene, arrow, 0.016, *push, PUSH)
+
+
+def _view(moments: Sequence[Moment], half: NDArray[np.float64]) -> mujoco.MjvCamera:
+    """From the front left and above, as near as everything that matters is in the picture.
+
+    `half` (2,) is half the width and height of the picture at unit distance.
+    """
+    places = np.concatenate(
+        [(moment.qpos[:3], moment.ee_pos_w, moment.target_pos_w) for moment in moments]
+        + [moment.foot_pos_w for moment in moments]
+    )
+    camera = mujoco.MjvCamera()
+    camera.lookat = (places.min(axis=0) + places.max(axis=0)) / 2
+    camera.azimuth, camera.elevation = AZIMUTH, ELEVATION
+    turn, tilt = np.deg2rad([AZIMUTH, ELEVATION])
+    ahead = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+    right = np.array([np.sin(turn), -np.cos(turn), 0.0])
+    seen = (places - camera.lookat) @ np.column_stack([right, np.cross(right, ahead), ahead])
+    camera.distance = float(((np.abs(seen[:, :2]) + MARGIN) / half - seen[:, 2:]).max())
+    return camera
+
+
+def _add_ball(scene: mujoco.MjvScene, pos_w: NDArray[np.float64], radius: float, colour) -> None:
+    ball, rgba = scene.geoms[scene.ngeom], np.array(colour, dtype=np.float32)
+    kind, size = mujoco.mjtGeom.mjGEOM_SPHERE.value, np.full(3, radius)
+    mujoco.mjv_initGeom(ball, kind, size, pos_w, np.eye(3).ravel(), rgba)
+    scene.ngeom += 1
+
+
+def _label(pixels: Pixels, moment: Moment, title: str) -> Pixels:
+    """Time and errors below, the title above."""
+    from PIL import Image, ImageDraw
+
+    picture = Image.fromarray(np.ascontiguousarray(pixels))
+    draw = ImageDraw.Draw(picture)
+    font = _font()
+    errors = f"{moment.position_error * CM:.1f} cm  {moment.orientation_error * DEG:.0f}°"
+    draw.text((10, picture.height - 24), f"{moment.time:.1f} s", INK, font)
+    draw.text((picture.width - 10, picture.height - 24), errors, INK, font, anchor="ra")
+    draw.text((10, 8), title, INK, font)
+    return np.asarray(picture)
+
+
+@cache
+def _font() -> Any:
+    """That of matplotlib, which is everywhere the same."""
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(Path(get_data_path(), "fonts/ttf/DejaVuSans.ttf")), 14)
