@@ -391,14 +391,15 @@ def test_a_chunk_is_followed_and_made_anew() -> None:
 def test_targets_follow_the_seed() -> None:
     policy = Policy(16)
 
-    def targets(seed: int) -> np.ndarray:
-        source = DiffusionSource(policy, DOOR, seed)
+    def targets(seed: int, episode: int = 0) -> np.ndarray:
+        source = DiffusionSource(policy, DOOR, seed, episode)
         source.look(np.array([0.5]))
         source.reset(seen_at(DOOR.hand(0.5)))
         return np.array([source.target(0.02 * k, seen_at(DOOR.hand(0.5))).pos for k in range(3)])
 
     np.testing.assert_array_equal(targets(1), targets(1))
-    assert np.abs(targets(1) - targets(2)).max() > 1e-3
+    for other in (targets(2), targets(1, 1)):
+        assert np.abs(targets(1) - other).max() > 1e-3
 
 
 # the closed loop
@@ -437,7 +438,7 @@ def test_the_packaged_policy_shuts_a_door() -> None:
     door = draw_door(door_protocol(1), 1, 0)
     source = load_source("diffusion")
     assert isinstance(source, DiffusionSource)
-    again = DiffusionSource(source._policy, door, 1, source.digest)
+    again = DiffusionSource(source._policy, door, 1)
     episode = demo.run_door(load_controller("ik", robot), again, door, "nominal", 1, 0)
     assert episode.success and episode.steps == 600
     assert 0.0 < episode.first_closed < 11.0

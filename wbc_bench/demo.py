@@ -171,7 +171,7 @@ def _source(policy: str | None, door: Door, seed: int, number: int) -> SceneSour
     from wbc_bench.sources.diffusion.source import DiffusionSource
 
     network, _, digest = find_policy(policy)
-    return DiffusionSource(network, door, seed + number, digest)
+    return DiffusionSource(network, door, seed, number, digest)
 
 
 def episode_table(episodes: list[DoorEpisode]) -> pd.DataFrame:

@@ -65,7 +65,7 @@ def load_source(
         policy, _, digest = find_policy(name.partition(":")[2])
         protocol = protocol or find_protocol("ablation_v1")[0]
         seed = protocol.episodes.seed
-        return DiffusionSource(policy, draw_door(protocol, seed, 0), seed, digest)
+        return DiffusionSource(policy, draw_door(protocol, seed, 0), seed, digest=digest)
     if name == "stream":
         return StreamSource(address, allow_remote=allow_remote)
     if name.startswith("stream:"):

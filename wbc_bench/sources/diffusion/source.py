@@ -22,15 +22,17 @@ EXECUTED = 8  # poses of a chunk until the next one is made
 class DiffusionSource:
     """Receding horizon: a chunk of poses, of which the first EXECUTED are followed, then another.
 
-    The noise it begins each chunk with is a stream of `seed`: equal episodes give equal targets.
+    The noise it begins each chunk with is the stream of `seed` and `episode`: equal episodes, equal targets.
     """
 
     live = False
 
-    def __init__(self, policy: Policy, door: Door, seed: int, digest: str | None = None) -> None:
+    def __init__(
+        self, policy: Policy, door: Door, seed: int, episode: int = 0, digest: str | None = None
+    ) -> None:
         self.name, self.scene, self.digest = "diffusion", DoorScene(door), digest
         self.counters: Mapping[str, int] = {}
-        self._policy, self._seed = policy, seed
+        self._policy, self._key = policy, (seed, episode)
 
     def look(self, scenery: Array) -> None:
         """The door's angle."""
@@ -38,7 +40,8 @@ class DiffusionSource:
 
     def reset(self, seen: Seen) -> None:
         """Forget what was seen."""
-        self._rng = stream(self._seed, "diffusion")
+        seed, episode = self._key
+        self._rng = stream(seed, "diffusion", episode)
         self._looks: list[tuple[float, Pose, Array]] = []  # time [s], tool, door; the latest last
         self._planned = -np.inf  # [s]
         self._chunk: list[Pose] = []  # of the tool, in the world
