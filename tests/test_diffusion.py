@@ -39,6 +39,7 @@ from wbc_bench.sources.diffusion.policy import (
 )
 from wbc_bench.sources.diffusion.scene import CLOSED, GRIP, STANDOFF, Door, DoorScene, draw_door
 from wbc_bench.sources.diffusion.source import DiffusionSource
+from wbc_bench.sources.library import POLICY
 from wbc_bench.sources.slew import Pose
 from wbc_bench.track import door_protocol, episode_of, track
 
@@ -433,6 +434,10 @@ def test_a_controller_that_does_not_follow_closes_nothing(capsys, tmp_path: Path
         read_doors(tmp_path)
 
 
+ships = pytest.mark.skipif(not POLICY.exists(), reason="no trained policy ships with the package yet")
+
+
+@ships
 def test_the_packaged_policy_shuts_a_door() -> None:
     robot = load_robot()
     door = draw_door(door_protocol(1), 1, 0)
@@ -444,6 +449,7 @@ def test_the_packaged_policy_shuts_a_door() -> None:
     assert 0.0 < episode.first_closed < 11.0
 
 
+@ships
 def test_track_stands_in_front_of_a_door() -> None:
     run, asked = track(load_controller("hold", load_robot()), load_source("diffusion"), "nominal", 0, 0.5)
     assert asked == 0.5 and np.isfinite(run.target_pos_w).all() and len(run.time) > 5
