@@ -18,6 +18,8 @@ CHAINS = (
     ("tables", "stats"),
     ("publish", "workspace", "plots", "tables"),
     ("publish", "report", "gallery", "tables"),
+    ("cli", "introspection", "latents", "plots", "tables"),
+    ("cli", "introspection", "control_loop", "observation"),
     ("publish", "store", "episodes"),
     ("cli", "execution", "store"),
     ("execution", "rollout", "simulation", "robot", "rotations"),
@@ -44,6 +46,7 @@ PURE = (
     "plots",
     "workspace",
     "gallery",
+    "latents",
     "report",
     "episodes",
     "tracking",
@@ -149,7 +152,7 @@ def test_analysis_needs_neither_physics_nor_learning(name):
 
 def test_the_command_line_starts_light():
     """`wbc-bench --help` must not wait for numpy, let alone MuJoCo."""
-    heavy = (*HEAVY, "numpy", "pandas", "scipy", "matplotlib", "joblib")
+    heavy = (*HEAVY, "numpy", "pandas", "scipy", "matplotlib", "joblib", "sklearn")
     code = f"import sys, wbc_bench.cli; print(*(m for m in {heavy} if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

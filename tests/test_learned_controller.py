@@ -16,9 +16,12 @@ from wbc_baselines.learned import checkpoint, inputs
 from wbc_baselines.learned.controller import LearnedController
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Policy
+from wbc_bench import latents
 from wbc_bench.cli import main
 from wbc_bench.controller import DEPLOYABLE, Observation, Target, load_controller
 from wbc_bench.errors import BenchError
+from wbc_bench.introspection import sample_latents
+from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.observation import Sensors
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import load_robot
@@ -286,3 +289,52 @@ def test_the_physics_step_and_the_seed_are_no_conditions():
     assert checkpoint.other_conditions(card, other) == ""
     longer = msgspec.structs.replace(protocol, episodes=msgspec.structs.replace(episodes, horizon=20.0))
     assert checkpoint.other_conditions(card, longer) == "episodes.horizon: trained 10.0, here 20.0"
+
+
+@pytest.mark.parametrize(("method", "columns"), [("transformer_gru", 64), ("cenet", 16)])
+def test_the_latent_of_an_estimator_is_sampled_with_the_error_it_saw(method, columns):
+    protocol, path = find_protocol("smoke_v1")
+    rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 3)
+    samples = sample_latents(make(method), protocol, rows)
+    batch = evaluate(make(method), protocol, rows)
+    assert samples.latent.shape == (batch.steps.sum(), columns) and np.ptp(samples.latent, axis=0).all()
+    for row, episode in enumerate(rows.episode):
+        own = samples.episode == episode
+        # the record's error is the one after a step, the sample's the one before it
+        error = batch.position_error[row, : batch.steps[row] - 1]
+        np.testing.assert_array_equal(samples.error[own][1:], error)
+
+
+def test_the_latent_is_what_the_actor_reads():
+    policy = Recording("transformer_gru")
+    protocol, path = find_protocol("smoke_v1")
+    rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 2)
+    controller = make("transformer_gru", policy)
+    evaluate(controller, protocol, rows)
+    window = policy.found[-1]["window"]
+    state = policy.seen[-1]["state"]
+    with torch.inference_mode():
+        context, _ = policy._policy.estimator.step(window, state)
+    np.testing.assert_array_equal(controller.latent(), context[:, 3:].numpy())
+
+
+@pytest.mark.parametrize("method", ["no_latent", "oracle"])
+def test_a_method_without_an_estimator_has_no_latent(method):
+    protocol, path = find_protocol("smoke_v1")
+    rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 2)
+    with pytest.raises(BenchError, match=rf"learned:{method}@0' shows no latent; valid: .*transformer_gru"):
+        sample_latents(make(method), protocol, rows)
+
+
+def test_the_command_draws_the_latent_of_a_checkpoint(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(latents, "DRAWN", 100)
+    spec = f"learned:{write(tmp_path, 'transformer_gru')}"
+    words = ["latent", "--controller", spec, "--protocol", "smoke_v1", "--episodes", "6", "-o", str(tmp_path)]
+    main(words)
+    printed = capsys.readouterr().out
+    assert "balanced accuracy" in printed and "chance" in printed
+    assert (tmp_path / "latent_learned-transformer_gru@0.png").exists()
+    for change, line in (({2: "hold"}, "shows no latent"), ({6: "3"}, "valid: 4 to 6")):
+        with pytest.raises(SystemExit):
+            main([change.get(k, word) for k, word in enumerate(words)])
+        assert line in capsys.readouterr().err

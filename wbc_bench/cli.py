@@ -360,6 +360,46 @@ class Report:
 
 
 @dataclass(frozen=True)
+class Latent:
+    """Draw the latent of a controller's estimator by phase of the task: t-SNE and LDA side by side."""
+
+    controller: str = tyro.MISSING
+    """Controller that shows its latent, e.g. learned:METHOD@SEED."""
+    protocol: str = "ablation_v1"
+    """Name of a released protocol, or a .toml file with its manifest beside it."""
+    episodes: int = 40
+    """First episodes of replicate 0; half of them are held out to test the discriminant."""
+    seed: int = 0
+    """Of the halves, of the points drawn and of t-SNE."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("results/figures")
+    """Folder of the figure and its numbers; a report beside it shows them."""
+
+    def run(self) -> None:
+        from wbc_bench.controller import load_controller, spec_of_replicate
+        from wbc_bench.introspection import sample_latents
+        from wbc_bench.latents import LEAST_EPISODES, summary, write_latents
+        from wbc_bench.manifest import manifest_path, read_manifest
+        from wbc_bench.protocol import find_protocol
+        from wbc_bench.robot import load_robot
+        from wbc_bench.store import ResultStore
+
+        protocol, path = find_protocol(self.protocol)
+        most = protocol.episodes.per_replicate
+        if not LEAST_EPISODES <= self.episodes <= most:
+            raise UsageError(f"--episodes {self.episodes}: valid: {LEAST_EPISODES} to {most}")
+        if self.seed < 0:
+            raise UsageError(f"--seed {self.seed}: valid: 0 or more")
+        manifest, _ = read_manifest(protocol, manifest_path(path))
+        spec = spec_of_replicate(self.controller, 0)
+        controller = load_controller(spec, load_robot(protocol.robot))
+        rows = manifest.of_replicate(0, self.episodes)
+        samples = sample_latents(controller, protocol, rows)
+        ResultStore(self.out).probe()
+        found, paths = write_latents(controller.info.name, protocol.name, samples, self.seed, self.out)
+        print(*summary(samples, found), *paths, sep="\n")
+
+
+@dataclass(frozen=True)
 class List:
     """List controllers, protocols, sources, metrics, benchmarks and runs."""
 
@@ -764,6 +804,7 @@ Command = (
     ]
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Report, subcommand("report")]
+    | Annotated[Latent, subcommand("latent")]
     | Annotated[List, subcommand("list")]
     | Annotated[
         Annotated[Freeze, subcommand("freeze")]

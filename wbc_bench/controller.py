@@ -117,6 +117,15 @@ class Exportable(Protocol):
 
 
 @runtime_checkable
+class ShowsLatent(Protocol):
+    """A controller that shows what it infers of the robot's dynamics and acts upon, for a picture of it."""
+
+    def latent(self) -> Array:
+        """(N, D) behind the latest commands. Raises: BenchError, this variant infers nothing."""
+        ...
+
+
+@runtime_checkable
 class PerReplicate(Protocol):
     """A factory whose variants may stand for several controllers, e.g. one training seed a replicate."""
 

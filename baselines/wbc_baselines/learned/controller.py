@@ -47,6 +47,7 @@ class LearnedController:
         )
         self.card, self.checkpoint_sha256 = card, sha256
         self._robot, self._engine, self._decay = robot, engine, REFERENCE_DECAY
+        self._latent: Tensor | None = None
         self._default_q = _tensor(robot.default_q)
 
     def prepare(self, protocol: EvalProtocol) -> None:
@@ -99,8 +100,20 @@ class LearnedController:
             values["privileged"] = _privileged(obs)
         found = self._engine(values)
         self._carried = {name: found[name] for name in self._carried}
-        self._action = found["action"]
+        self._action, self._latent = found["action"], found.get("latent")
         return JointCommand(self._robot.command_of(self._action.numpy().astype(np.float64)))
+
+    def latent(self) -> NDArray[np.float64]:
+        """The dynamics latent (N, 64; 16 of cenet) behind the latest commands; the velocity is left out.
+
+        Raises: CheckpointError, the method has no estimator or the policy is an exported one.
+        """
+        if self._latent is None:
+            shown = ", ".join(name for name in METHODS if name not in ("no_latent", "oracle"))
+            raise CheckpointError(
+                f"'{self.info.name}' shows no latent; valid: checkpoints (`learned:`) of {shown}"
+            )
+        return self._latent.numpy().astype(np.float64)
 
     def export(self, path: Path, format: str) -> None:
         """Write the policy as ONNX. Raises: CheckpointError, it comes from such a file already."""

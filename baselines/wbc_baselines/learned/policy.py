@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from wbc_baselines.learned.estimators import Estimator
-from wbc_baselines.learned.inputs import COMMAND, HISTORY, HISTORY_TERM, OBSERVATION, PRIVILEGED
+from wbc_baselines.learned.inputs import COMMAND, HISTORY, HISTORY_TERM, OBSERVATION, PRIVILEGED, VELOCITY
 from wbc_baselines.learned.networks import Actor
 
 
@@ -26,7 +26,7 @@ class Policy(nn.Module):
         self.flow = flow_of(estimator)
 
     def forward(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        """One control step of N robots; names and widths are those of `flow`."""
+        """One control step of N robots; names and widths are those of `flow`, and maybe the `latent`."""
         parts, found = [values["observation"], values["command"]], {}
         if "privileged" in values:
             parts.append(values["privileged"])
@@ -35,6 +35,7 @@ class Policy(nn.Module):
             state = values.get("state", values["term"][:, :0])
             context, state = self.estimator.step(found["window"], state)
             parts.append(context)
+            found["latent"] = context[:, VELOCITY:]
             if "state" in values:
                 found["state"] = state
         return {"action": self.actor(torch.cat(parts, dim=-1))} | found

@@ -1,0 +1,40 @@
+"""The latent of a controller while it meets episodes, step by step."""
+
+import numpy as np
+
+from wbc_bench.control_loop import ControlLoop
+from wbc_bench.controller import Controller, ShowsLatent
+from wbc_bench.errors import ControllerError
+from wbc_bench.latents import Samples
+from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.protocol import EvalProtocol
+
+
+def sample_latents(controller: Controller, protocol: EvalProtocol, rows: EpisodeManifest) -> Samples:
+    """The latent of every control step of some episodes, and the position error that it was inferred at.
+
+    Raises: ControllerError, the controller shows no latent or one of the wrong shape.
+    """
+    if not isinstance(controller, ShowsLatent):
+        raise ControllerError(
+            f"controller '{controller.info.name}' shows no latent: it has no method `latent`"
+        )
+    loop = ControlLoop(controller, protocol, rows)
+    target = loop.sensors.target(loop.state)
+    loop.reset(target)
+    parts = []
+    for step in range(protocol.num_steps):
+        error = np.linalg.norm(loop.state.ee_pos_w - rows.target_pos_w, axis=1)  # (N,) [m]
+        ran = loop.advance(target).ran
+        latent = np.asarray(controller.latent(), dtype=np.float64)
+        if latent.ndim != 2 or len(latent) != len(rows):
+            raise ControllerError(
+                f"controller '{controller.info.name}' shows a latent of shape {latent.shape}, "
+                f"expected ({len(rows)}, columns)"
+            )
+        time = np.full(ran.sum(), step * protocol.control_period)  # [s]
+        parts.append((latent[ran], error[ran], rows.episode[ran], time))
+        if not loop.active.any():
+            break
+        target = loop.sensors.target(loop.state)
+    return Samples(*map(np.concatenate, zip(*parts, strict=True)))
