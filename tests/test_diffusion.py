@@ -70,7 +70,7 @@ def seen_at(hand: Pose) -> Seen:
 def card(**changed) -> Card:
     facts = {"format": 1, "seed": 0, "demonstrations": 1, "demonstrations_seed": 0, "samples": 1, "steps": 1}
     facts |= {"demonstrations_sha256": "0" * 64, "batch": 1, "hidden": 16, "git_commit": None}
-    return Card(**facts | {"git_dirty": False, "torch": "0"} | changed)
+    return Card(**facts | {"git_dirty": False, "torch": "0"} | changed)  # pyright: ignore[reportArgumentType]
 
 
 # the scene
@@ -425,7 +425,7 @@ def test_a_controller_that_does_not_follow_closes_nothing(capsys, tmp_path: Path
     main([*words, "--out", str(tmp_path)])
     (run,) = read_doors(tmp_path)
     assert run.record.successes == 0 and run.record.completed == 2 and run.record.policy_sha256 is None
-    assert set(run.episodes["outcome"]) <= {"fell", "illegal_contact"} and not run.episodes["success"].any()
+    assert set(run.episodes["outcome"]) <= {"fell", "illegal_contact"} and not run.episodes["success"].any()  # pyright: ignore[reportGeneralTypeIssues]
     row = dict(zip(door_table([run]).header, door_table([run]).rows[0], strict=True))
     assert row["Closed ↑"] == "0/2" and row["Falls ↓"] == "2" and (tmp_path / "tables" / "doors.md").exists()
     beside = next(tmp_path.glob("doors/*/*/*/episodes.parquet"))
@@ -444,7 +444,7 @@ def test_the_packaged_policy_shuts_a_door() -> None:
     source = load_source("diffusion")
     assert isinstance(source, DiffusionSource)
     again = DiffusionSource(source._policy, door, 1)
-    episode = demo.run_door(load_controller("ik", robot), again, door, "nominal", 1, 0)
+    episode = demo.run_door(load_controller("ik", robot), again, door, "nominal", 1, 0)  # pyright: ignore[reportArgumentType]
     assert episode.success and episode.steps == 600
     assert 0.0 < episode.first_closed < 11.0
 

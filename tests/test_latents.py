@@ -24,7 +24,7 @@ def synthetic(
     offset = rng.normal(size=(episodes, columns))[episode]
     means = np.eye(3, columns) * separation
     latent = means[latents.phase_of(error)] + rng.normal(size=(len(error), columns)) * 0.3 + offset
-    return Samples(latent, error, episode, np.tile(np.arange(steps) * 0.02, episodes))
+    return Samples(latent, error, episode, np.tile(np.arange(steps) * 0.02, episodes))  # pyright: ignore[reportArgumentType]
 
 
 def test_phases_follow_the_error():

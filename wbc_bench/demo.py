@@ -156,7 +156,7 @@ def _run_all(
     parallel = Parallel(n_jobs=workers, return_as="generator")
     for done, episode in enumerate(parallel(jobs), 1):  # pyright: ignore[reportArgumentType]
         progress(done, count)
-        yield episode
+        yield episode  # pyright: ignore[reportReturnType]
 
 
 def _run_one(policy: str | None, spec: str, condition: str, seed: int, number: int) -> DoorEpisode:
@@ -167,11 +167,11 @@ def _run_one(policy: str | None, spec: str, condition: str, seed: int, number: i
 
 def _source(policy: str | None, door: Door, seed: int, number: int) -> SceneSource:
     if policy is None:
-        return ExpertSource(door)
+        return ExpertSource(door)  # pyright: ignore[reportReturnType]
     from wbc_bench.sources.diffusion.source import DiffusionSource
 
     network, _, digest = find_policy(policy)
-    return DiffusionSource(network, door, seed, number, digest)
+    return DiffusionSource(network, door, seed, number, digest)  # pyright: ignore[reportReturnType]
 
 
 def episode_table(episodes: list[DoorEpisode]) -> pd.DataFrame:

@@ -66,7 +66,7 @@ def write_doors(root: Path, episodes: pd.DataFrame, **facts) -> Path:
     data = sink.getvalue().to_pybytes()
     record = DoorRecord(
         completed=len(episodes),
-        successes=int(episodes["success"].sum()),
+        successes=int(episodes["success"].sum()),  # pyright: ignore[reportArgumentType]
         episodes_sha256=hashlib.sha256(data).hexdigest(),
         **facts,
     )
@@ -122,15 +122,15 @@ def door_table(runs: list[DoorRun]) -> Table:
                 str(record.seed),
                 f"{record.successes}/{record.completed}",
                 f"{rate.low * 100:.1f} to {rate.high * 100:.1f}",
-                str(int((~stood).sum())),
-                *(_cell(value, 1) for value in (final.median(), final.max(), took.median())),
+                str(int((~stood).sum())),  # pyright: ignore[reportArgumentType]
+                *(_cell(value, 1) for value in (final.median(), final.max(), took.median())),  # pyright: ignore[reportArgumentType]
             )
         )
         data.append(
             {"source": record.source, "policy_sha256": digest or "", "controller": record.controller}
             | {"condition": record.condition, "seed": record.seed, "requested": record.requested}
             | {"completed": record.completed, "successes": record.successes, "rate": rate.point}
-            | {"wilson_low": rate.low, "wilson_high": rate.high, "falls": int((~stood).sum())}
+            | {"wilson_low": rate.low, "wilson_high": rate.high, "falls": int((~stood).sum())}  # pyright: ignore[reportArgumentType]
             | {"final_angle_median_deg": final.median(), "final_angle_max_deg": final.max()}
             | {"first_closed_median_s": took.median()}
         )

@@ -58,7 +58,7 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
     shown = range(0, len(again.moments), EVERY)
     try:
         with Camera(again, SIZE) as camera:
-            writer = write_frames(str(part), SIZE, fps=rate, quality=7, ffmpeg_log_level="error")
+            writer = write_frames(str(part), SIZE, fps=rate, quality=7, ffmpeg_log_level="error")  # pyright: ignore[reportArgumentType]
             writer.send(None)
             for number, k in enumerate(shown, 1):
                 writer.send(camera.picture(k, again.title))
@@ -92,7 +92,7 @@ def strip_of(again: Rerun, times: Sequence[float] | None = None) -> Pixels:
     if times is None:
         times = np.linspace(0.0, clock[-1], PANELS).tolist()
     with Camera(again, PANEL, samples=4) as camera:
-        pictures = [camera.picture(int(np.abs(clock - time).argmin())) for time in times]
+        pictures = [camera.picture(int(np.abs(clock - time).argmin())) for time in times]  # pyright: ignore[reportOptionalIterable]
     gap = np.full((PANEL[1], GAP, 3), 255, dtype=np.uint8)
     return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
 

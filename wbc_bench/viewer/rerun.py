@@ -111,7 +111,7 @@ def rerun(
         result = Rerun(run, protocol, robot, episode, stored, again, moments)
         if not result.differences or record.machine.get("processor") != machine().get("processor"):
             break
-    return result
+    return result  # pyright: ignore[reportPossiblyUnboundVariable]
 
 
 def _watched(

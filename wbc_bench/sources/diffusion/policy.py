@@ -51,6 +51,11 @@ class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 class Policy(nn.Module):
     """Normalisers and network; ranges of every number of a look and of every step's action."""
 
+    look_middle: Tensor
+    look_half: Tensor
+    action_middle: Tensor
+    action_half: Tensor
+
     def __init__(self, hidden: int = HIDDEN) -> None:
         super().__init__()
         self.denoiser = Denoiser(HORIZON * ACTION, LOOKS * LOOK, hidden)
