@@ -434,10 +434,6 @@ def test_a_controller_that_does_not_follow_closes_nothing(capsys, tmp_path: Path
         read_doors(tmp_path)
 
 
-ships = pytest.mark.skipif(not POLICY.exists(), reason="no trained policy ships with the package yet")
-
-
-@ships
 def test_the_packaged_policy_shuts_a_door() -> None:
     robot = load_robot()
     door = draw_door(door_protocol(1), 1, 0)
@@ -449,7 +445,14 @@ def test_the_packaged_policy_shuts_a_door() -> None:
     assert 0.0 < episode.first_closed < 11.0
 
 
-@ships
+def test_the_packaged_policy_is_small_and_the_one_of_the_record() -> None:
+    _, found, digest = load_policy(POLICY)
+    assert POLICY.stat().st_size < 1 << 20 and not found.git_dirty
+    runs = [run.record for run in read_doors(Path(__file__).parents[1] / "results")]
+    assert {run.policy_sha256 for run in runs if run.source == "diffusion"} == {digest}
+    assert all(run.seed != found.demonstrations_seed for run in runs)
+
+
 def test_track_stands_in_front_of_a_door() -> None:
     run, asked = track(load_controller("hold", load_robot()), load_source("diffusion"), "nominal", 0, 0.5)
     assert asked == 0.5 and np.isfinite(run.target_pos_w).all() and len(run.time) > 5
