@@ -11,6 +11,7 @@ from wbc_bench.rotations import (
     matrix_from_wxyz,
     rho6,
     rotvec_from_matrix,
+    rpy_from_matrix,
     wxyz_from_matrix,
     wxyz_from_xyzw,
     xyzw_from_wxyz,
@@ -49,6 +50,7 @@ def test_agrees_with_scipy() -> None:
     close(matrix_from_rotvec(SCIPY.as_rotvec()), ROT)
     rpy = np.random.default_rng(2).uniform(-4, 4, (COUNT, 3))
     close(matrix_from_rpy(rpy), Rotation.from_euler("xyz", rpy).as_matrix())  # lower case: fixed axes
+    close(rpy_from_matrix(ROT), SCIPY.as_euler("xyz"))
     angle = (SCIPY[:-1].inv() * SCIPY[1:]).magnitude()
     close(geodesic_angle(ROT[:-1], ROT[1:]), angle, 1e-12)
 

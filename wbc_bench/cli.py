@@ -238,6 +238,40 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Live:
+    """Watch a controller in the browser, in real time, and drag its target."""
+
+    controller: str = tyro.MISSING
+    """Controller: name, name:variant, module:attribute or file.py:attribute."""
+    source: str = "live"
+    """live: the target is dragged in the page. Otherwise a source as `track` takes it."""
+    protocol: str = "ablation_v1"
+    """Protocol whose physics, randomisation, noise and limits hold."""
+    condition: str = "nominal"
+    """nominal, or randomised: friction, mass, gains, reset state and noise of the protocol."""
+    seed: int = 0
+    """Of the draws of a randomised episode."""
+    port: int = 8080
+    """Of the page."""
+    allow_remote: FlagCreatePairsOff[bool] = False
+    """Let other machines open the page, and move the robot."""
+
+    def run(self) -> None:
+        from wbc_bench.viewer.live import serve
+
+        if not 0 < self.port < 1 << 16:
+            raise UsageError(f"--port {self.port}: valid: 1 to 65535")
+        if self.seed < 0:
+            raise UsageError(f"--seed {self.seed}: valid: 0 or more")
+        host = "0.0.0.0" if self.allow_remote else "127.0.0.1"
+        asked = self.controller, self.source, self.protocol, self.condition, self.seed
+        try:
+            serve(host, self.port, asked, lambda url: print(f"{url}  (Ctrl-C ends it)", flush=True))
+        except KeyboardInterrupt:
+            print()
+
+
+@dataclass(frozen=True)
 class _Again:
     name: Annotated[Positional[str], tyro.conf.arg(name="run")]
     """Folder of a run, or <protocol>/<controller>/replicate_<k> of the records."""
@@ -287,6 +321,14 @@ class Film(_Again):
 
     def run(self) -> None:
         from matplotlib import image
+
+        try:
+            import mujoco  # noqa: F401
+        except (ImportError, AttributeError) as error:  # it loads the library of MUJOCO_GL at once
+            chosen = os.environ.get("MUJOCO_GL", "")
+            raise UsageError(
+                f"MuJoCo cannot draw with MUJOCO_GL={chosen} ({error}): install it or unset that"
+            ) from error
 
         from wbc_bench.progress import Progress
         from wbc_bench.store import ResultStore
@@ -794,6 +836,7 @@ Command = (
     | Annotated[Reach, subcommand("reach")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Track, subcommand("track")]
+    | Annotated[Live, subcommand("live")]
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Film, subcommand("film")]
     | Annotated[

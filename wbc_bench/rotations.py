@@ -67,6 +67,16 @@ def matrix_from_rpy(rpy: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def rpy_from_matrix(rot: Array) -> Array:
+    """Roll, pitch, yaw (..., 3) [rad] of rotation matrices (..., 3, 3), pitch in [-pi/2, pi/2]. Source: URDF.
+
+    At a pitch of +-pi/2 only the sum or difference of the others is defined.
+    """
+    pitch = np.arctan2(-rot[..., 2, 0], np.hypot(rot[..., 0, 0], rot[..., 1, 0]))
+    roll = np.arctan2(rot[..., 2, 1], rot[..., 2, 2])
+    return np.stack([roll, pitch, np.arctan2(rot[..., 1, 0], rot[..., 0, 0])], axis=-1)
+
+
 def matrix_from_rotvec(rotvec: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad]. Source: Rodrigues' formula."""
     angle = np.linalg.norm(rotvec, axis=-1)[..., None, None]

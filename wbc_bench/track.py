@@ -1,5 +1,6 @@
 """One simulated episode driven by a source instead of a manifest: what `wbc-bench track` runs."""
 
+import dataclasses
 import math
 import time as clocks
 from collections.abc import Callable
@@ -178,8 +179,23 @@ def episode_of(
     return protocol, _row(protocol, condition, episode)
 
 
-def _protocol(duration: float, seed: int) -> EvalProtocol:
-    protocol, _ = find_protocol(BASE_PROTOCOL)
+def free_episode(
+    base: str, condition: str, seed: int, duration: float
+) -> tuple[EvalProtocol, EpisodeManifest]:
+    """An episode of `duration` [s] as protocol `base` has them, but without pushes and target.
+
+    Raises: UnknownNameError, ProtocolError.
+    """
+    if condition not in CONDITIONS:
+        raise UnknownNameError("condition", condition, CONDITIONS, "--condition")
+    protocol = _protocol(duration, seed, base)
+    row = _row(protocol, condition)
+    calm = np.full_like(row.push_time, np.nan), np.zeros_like(row.push_vel)
+    return protocol, dataclasses.replace(row, push_time=calm[0], push_vel=calm[1])
+
+
+def _protocol(duration: float, seed: int, base: str = BASE_PROTOCOL) -> EvalProtocol:
+    protocol, _ = find_protocol(base)
     episodes = msgspec.structs.replace(
         protocol.episodes, replicates=1, per_replicate=1, horizon=duration, seed=seed
     )

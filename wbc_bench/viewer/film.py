@@ -53,12 +53,19 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
         from imageio_ffmpeg import write_frames
     except ImportError as error:
         raise BenchError("a film needs imageio-ffmpeg: pip install 'wbc-bench[film]'") from error
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp.mp4")
+    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     rate = 1 / (EVERY * again.protocol.control_period)  # [1/s]
     shown = range(0, len(again.moments), EVERY)
     try:
         with Camera(again, SIZE) as camera:
-            writer = write_frames(str(part), SIZE, fps=rate, quality=7, ffmpeg_log_level="error")  # pyright: ignore[reportArgumentType]
+            writer = write_frames(
+                str(part),
+                SIZE,  # pyright: ignore[reportArgumentType]
+                fps=rate,  # pyright: ignore[reportArgumentType]
+                quality=7,
+                ffmpeg_log_level="error",
+                output_params=["-f", "mp4"],
+            )
             writer.send(None)
             for number, k in enumerate(shown, 1):
                 writer.send(camera.picture(k, again.title))

@@ -12,7 +12,7 @@ from wbc_bench.viewer.scene import Scene, serving
 
 EVERY = 2  # control steps a picture: 25 a second
 CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
-CHART = (400, 48)  # [px] width, height of the error chart
+CHART = (370, 48)  # [px] width, height of the error chart
 
 
 def write_html(
@@ -58,7 +58,8 @@ def _caption(again: Rerun) -> str:
     style = "color:#1b7f4b" if not again.differences else "color:#a05a00"
     facts.append(f'<span style="{style}">{html.escape(again.verdict)}</span>')
     return (
-        '<div style="position:fixed;top:12px;right:12px;z-index:5;width:400px;padding:10px 14px;'
+        '<div style="position:fixed;top:12px;right:12px;z-index:5;box-sizing:border-box;width:400px;'
+        "padding:10px 14px;"
         "background:rgba(255,255,255,.92);border:1px solid #d5d9de;border-radius:6px;color:#1b2330;"
         f'font:13px/1.5 system-ui,sans-serif;pointer-events:none">{"<br>".join(facts)}{_chart(again)}</div>'
     )
@@ -77,8 +78,8 @@ def _chart(again: Rerun) -> str:
         y = CHART[1] * (1 - values / most)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::5], y[::5], strict=True))
         lines.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
-        names.append(f'<span style="color:{colour}">{name} error 0–{most:.1f} {unit}</span>')
+        names.append(f'<span style="color:{colour}">{name} 0–{most:.1f} {unit}</span>')
     return (
         f'<svg width="{CHART[0]}" height="{CHART[1] + 2}" style="display:block;margin-top:6px;'
-        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>{", ".join(names)}, 0–{time[-1]:.1f} s'
+        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>error: {", ".join(names)}'
     )

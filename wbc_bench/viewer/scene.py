@@ -21,11 +21,13 @@ Colour = tuple[int, int, int]
 
 INSIDE, OUTSIDE = (36, 150, 90), (226, 128, 30)  # of the tolerance
 HAND, TARGET = (40, 100, 200), OUTSIDE  # trails
-GROUND, CELL, SECTION = (246, 247, 248), (222, 226, 230), (196, 202, 208)
+GROUND, CELL = (244, 245, 247), (205, 210, 216)
+LIGHT, FIELD_OF_VIEW = 1.6, 0.75  # [1], [rad]
 SUPPORT, COM, FORCE, PUSH = (90, 170, 230), (24, 36, 64), (44, 150, 150), (210, 50, 110)
 BONE_RADIUS, BONE = 0.014, (140, 148, 158)  # [m] rods between joints: the collision shapes leave gaps there
 CHUNK = 5  # points in one piece of a trail
 NEW_POINT = 0.004  # [m] a trail grows only where something moves
+FACE = 6e-4  # [m] that a box is larger than the one before, three times in four
 FLOOR = 0.002  # [m] above the ground, so that nothing flickers in it
 
 
@@ -62,12 +64,14 @@ class Scene:
         # software renderers draw shadows and reflections slowly, and in stripes
         scene.configure_default_lights(enabled=True, cast_shadow=False)
         scene.configure_environment_map(None)
-        server.initial_camera.position, server.initial_camera.look_at = (2.0, -2.1, 1.5), (0.15, 0.0, 0.65)
+        scene.add_light_hemisphere("/light", ground_color=(190, 190, 190), intensity=LIGHT)
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.fov = (2.3, -2.2, 1.5), (0.15, 0.0, 0.68), FIELD_OF_VIEW
         scene.add_grid(
             "/ground",
             *(8.0, 8.0),
-            **{"cell_size": 0.1, "cell_color": CELL, "section_size": 0.5, "section_color": SECTION},
-            **{"section_thickness": 1.5, "plane_color": GROUND, "plane_opacity": 1.0, "shadow_opacity": 0.0},
+            **{"cell_size": 0.5, "cell_color": CELL, "section_size": 0.5, "section_color": CELL},
+            **{"plane_color": GROUND, "plane_opacity": 1.0, "shadow_opacity": 0.0},
         )
         self._bodies = _add_robot(scene, self.skeleton.model)
         self._target = scene.add_frame("/target", axes_length=0.16, axes_radius=0.006, origin_radius=0.0)
@@ -178,7 +182,8 @@ def _add_geom(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> None:
     colour = tuple(int(255 * c) for c in model.geom_rgba[geom, :3])
     pose = {"position": model.geom_pos[geom], "wxyz": model.geom_quat[geom]}
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        scene.add_box(name, colour, tuple(2 * size), **pose)
+        # boxes that share a face would flicker there
+        scene.add_box(name, colour, tuple(2 * size + FACE * (geom % 4)), **pose)
     elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         scene.add_icosphere(name, float(size[0]), colour, subdivisions=1, **pose)
     else:

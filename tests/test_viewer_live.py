@@ -1,0 +1,159 @@
+"""The live view: the session without a page, and the page in a headless browser."""
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from wbc_bench.errors import BenchError, SourceError, UnknownNameError
+from wbc_bench.sources.slew import Limits
+from wbc_bench.viewer.session import Session
+
+ASKED = ("ik", "live", "ablation_v1", "nominal", 0)
+AWAY = np.array([0.06, -0.08, 0.04])  # [m] from the hand, within reach of the arm
+
+
+def seconds(session: Session, duration: float) -> None:
+    for _ in range(round(duration / session.period)):
+        session.step()
+
+
+def test_the_hand_stays_until_it_is_told_and_then_follows() -> None:
+    session = Session(*ASKED)
+    start = session.moment
+    seconds(session, 1.0)
+    assert session.moment.position_error < 0.01 and session.status == "standing"
+    session.set_goal(start.ee_pos_w + AWAY, np.array([1.0, 0.0, 0.0, 0.0]))
+    seconds(session, 0.1)
+    moved = np.linalg.norm(session.moment.target_pos_w - start.ee_pos_w)
+    assert 0 < moved <= Limits().linear * 0.1 + 1e-9  # the target goes there, it does not jump
+    seconds(session, 3.0)
+    assert np.allclose(session.moment.target_pos_w, start.ee_pos_w + AWAY)
+    assert session.moment.position_error < 0.02
+
+
+def test_the_same_steps_give_the_same_bits_and_a_restart_forgets() -> None:
+    session = Session("ik", "figure_eight", "ablation_v1", "randomised", 3)
+    seconds(session, 0.5)
+    first = session.moment
+    session.restart()
+    assert session.moment.time == 0.0
+    seconds(session, 0.5)
+    assert all(np.array_equal(a, b) for a, b in zip(first, session.moment, strict=True))
+
+
+def test_a_push_is_felt_and_seen() -> None:
+    session = Session("hold", *ASKED[1:])
+    before = session.moment.qpos[:2].copy()
+    session.push(np.array([0.0, 0.5]))
+    session.step()
+    moved = session.moment.qpos[:2] - before
+    assert moved[1] > 0.005 > abs(moved[0])  # 0.5 m/s for 0.02 s is 0.01 m
+    assert np.array_equal(session.moment.push_w, [0.0, 0.5])
+    seconds(session, 0.5)
+    assert not session.moment.push_w.any()
+
+
+def test_it_ends_with_a_fall_and_goes_on_after_a_restart() -> None:
+    session = Session("hold", *ASKED[1:])
+    for _ in range(4):
+        session.push(np.array([2.0, 0.0]))
+        seconds(session, 0.5)
+    assert session.status in ("fell", "illegal contact") and not session.running
+    ended = session.moment.time
+    session.step()
+    assert session.moment.time == ended
+    session.restart("ik")
+    seconds(session, 1.0)
+    assert session.running and session.controller.info.name == "ik"
+
+
+def test_what_cannot_be_loaded_changes_nothing() -> None:
+    session = Session("hold", *ASKED[1:])
+    seconds(session, 0.1)
+    for change in ({"spec": "holt"}, {"source": "figure_nine"}):
+        with pytest.raises(UnknownNameError, match="did you mean"):
+            session.restart(**change)
+    assert session.moment.time == pytest.approx(0.1) and session.dragged
+    with pytest.raises(SourceError, match="finite"):
+        session.set_goal(np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
+    with pytest.raises(UnknownNameError, match="condition"):
+        Session("hold", "live", "ablation_v1", "perturbed", 0)
+
+
+# --- the page -------------------------------------------------------------------------------------------
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Served:
+    """A page that is served on a thread of its own."""
+
+    def __init__(self) -> None:
+        from wbc_bench.viewer.live import LiveView
+        from wbc_bench.viewer.scene import serving
+
+        self.session, self._stop, self._ready = Session(*ASKED), threading.Event(), threading.Event()
+
+        def run() -> None:
+            with serving(port=free_port()) as self.server:
+                self.view = LiveView(self.server, self.session)
+                self._ready.set()
+                self.view.run(self._stop)
+
+        self._thread = threading.Thread(target=run, daemon=True)
+        self._thread.start()
+        assert self._ready.wait(60)
+        self.url = f"http://127.0.0.1:{self.server.get_port()}"
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join(20)
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    pytest.importorskip("viser")
+    page = Served()
+    yield page
+    page.close()
+
+
+def wait_for(condition: Callable[[], bool], seconds: float, what: str) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, f"after {seconds:g} s still not: {what}"
+        time.sleep(0.05)
+
+
+def test_the_gizmo_sets_the_target_and_the_field_shows_it(served: Served) -> None:
+    view, session = served.view, served.session
+    goal = session.moment.ee_pos_w + AWAY
+    view.gizmo.position, view.gizmo.wxyz = goal, (1.0, 0.0, 0.0, 0.0)
+    view._goal_moved()  # what viser calls after a drag
+    wait_for(lambda: bool(np.linalg.norm(session.moment.ee_pos_w - goal) < 0.02), 60, "the hand is there")
+    assert np.allclose(view.panel._pos.value, goal, atol=1e-3)
+    view.ask(lambda: view.restart("holt"))
+    wait_for(lambda: "did you mean" in view.panel._message.content, 20, "the mistake is shown")
+    view.ask(view.restart)
+    wait_for(lambda: not view.panel._message.visible, 20, "it is forgotten")
+    wait_for(lambda: session.moment.time < 5.0, 20, "a new episode")
+
+
+def test_a_port_that_is_taken_is_refused() -> None:
+    pytest.importorskip("viser")
+    from wbc_bench.viewer.live import serve
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(BenchError, match=f"port {port} is in use"):
+            serve("127.0.0.1", port, ("hold", *ASKED[1:]), print)

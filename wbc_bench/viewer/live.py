@@ -1,0 +1,151 @@
+"""The robot in a browser, in real time: `wbc-bench live`.
+
+One thread steps and draws; what a person does in the page arrives on other threads and waits in a queue.
+"""
+
+import threading
+import time as clocks
+from collections import deque
+from collections.abc import Callable
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from wbc_bench.errors import BenchError
+from wbc_bench.viewer.moment import Moment
+from wbc_bench.viewer.panel import Panel
+from wbc_bench.viewer.scene import Scene, serving
+from wbc_bench.viewer.session import Session, hand_pose
+
+DRAW_PERIOD, PANEL_PERIOD = 0.04, 0.25  # [s]
+TRAIL_PIECES = 60
+GIZMO = 0.22  # [m]
+MAX_LAG = 0.5  # [s] behind real time that is made up for; more is let go
+
+
+class LiveView:
+    """A session and its page."""
+
+    def __init__(self, server: Any, session: Session) -> None:
+        self.session = session
+        self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self.paused, self.speed = False, 1.0
+        self.scene = Scene(server, session.robot, session.protocol.success, TRAIL_PIECES)
+        self.gizmo = server.scene.add_transform_controls(
+            "/goal", scale=GIZMO, line_width=4.0, depth_test=False
+        )
+        self.panel = Panel(server, self)
+        self.gizmo.on_update(lambda _: self._goal_moved())
+        self._pace: deque[tuple[float, float]] = deque(maxlen=100)  # (wall, simulated) [s]
+        self._drawn: Moment | None = None
+        self._begin()
+
+    # what the page asks for, from its threads
+
+    def ask(self, command: Callable[[], None]) -> None:
+        """Let a command run between two steps; what is wrong with it is shown in the page."""
+        self._commands.put(command)
+
+    def set_goal(self, pos_w: np.ndarray, wxyz: np.ndarray) -> None:
+        """A goal that did not come from the gizmo, (3,) [m] and (4,): the gizmo goes there."""
+        self.gizmo.position, self.gizmo.wxyz = pos_w, wxyz
+        self._goal_moved()
+
+    def restart(self, spec: str | None = None, source: str | None = None) -> None:
+        """See `Session.restart`."""
+        self.session.restart(spec, source)
+        self._begin()
+
+    def step_once(self) -> None:
+        """Pause, and take one step."""
+        self.paused = True
+        self._step()
+
+    # the loop
+
+    def run(self, stop: threading.Event) -> None:
+        """Step, draw and obey until told to stop."""
+        due = drawn = told = clocks.monotonic()
+        while not stop.is_set():
+            self._obey()
+            now = clocks.monotonic()
+            if self.paused or not self.session.running:
+                due = now + 0.02
+                self._pace.clear()
+            elif now >= due:
+                self._step()
+                due = max(due + self.session.period / self.speed, now - MAX_LAG)
+            if now - drawn >= DRAW_PERIOD:
+                drawn = now
+                self._draw()
+            if now - told >= PANEL_PERIOD:
+                told = now
+                self.panel.update(self.real_time_factor)
+            clocks.sleep(max(0.0, due - clocks.monotonic()))
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated by elapsed time over the last steps; NaN when nothing moves."""
+        if len(self._pace) < 2:
+            return float("nan")
+        (wall, simulated), (wall_now, simulated_now) = self._pace[0], self._pace[-1]
+        return (simulated_now - simulated) / max(wall_now - wall, 1e-9)
+
+    def _step(self) -> None:
+        self.session.step()
+        self._pace.append((clocks.monotonic(), self.session.moment.time))
+        self.panel.record(self.session.moment)
+
+    def _draw(self) -> None:
+        if self._drawn is not self.session.moment:
+            self._drawn = self.session.moment
+            self.scene.show(self._drawn)
+
+    def _obey(self) -> None:
+        while True:
+            try:
+                command = self._commands.get_nowait()
+            except Empty:
+                return
+            try:
+                command()
+                self.panel.say("")
+            except BenchError as error:
+                self.panel.say(str(error))
+
+    def _begin(self) -> None:
+        self._pace.clear()
+        self.scene.clear()
+        self.gizmo.position, self.gizmo.wxyz = hand_pose(self.session.moment)
+        self.gizmo.visible = self.session.dragged
+        self.panel.begin()
+        self._draw()
+
+    def _goal_moved(self) -> None:
+        pos_w, wxyz = np.array(self.gizmo.position), np.array(self.gizmo.wxyz)
+        self.session.set_goal(pos_w, wxyz / np.linalg.norm(wxyz))
+        self.panel.show_goal(pos_w, wxyz)
+
+
+def serve(
+    host: str,
+    port: int,
+    asked: tuple[str, str, str, str, int],
+    ready: Callable[[str], None],
+    stop: threading.Event | None = None,
+) -> None:
+    """Run a session (`asked`: see `Session`) in a page until told to stop; `ready` is given its address.
+
+    Raises: BenchError, what of it cannot be loaded, or that the port is taken.
+    """
+    session = Session(*asked)
+    try:
+        with serving(host, port) as server:
+            if server.get_port() != port:
+                raise BenchError(f"port {port} is in use, valid: another --port, e.g. {server.get_port()}")
+            view = LiveView(server, session)
+            ready(f"http://{'localhost' if host == '0.0.0.0' else host}:{port}")
+            view.run(stop or threading.Event())
+    finally:
+        session.close()

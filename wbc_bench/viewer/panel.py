@@ -1,0 +1,145 @@
+"""What stands beside the scene of the live view: read-outs, charts and controls."""
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wbc_bench.controller import controllers
+from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, rpy_from_matrix, wxyz_from_matrix
+from wbc_bench.viewer.moment import Array, Moment
+from wbc_bench.viewer.session import live_source_names
+
+if TYPE_CHECKING:
+    from wbc_bench.viewer.live import LiveView
+
+CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
+CHART_SECONDS, CHART_EVERY = 10.0, 5  # [s], control steps a point
+POSITION_COLOUR, ORIENTATION_COLOUR = "#2864c8", "#b0446e"
+PUSHES = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}  # world x, y
+
+
+class Panel:
+    """Shows a view, and asks it for what a person wants."""
+
+    def __init__(self, server: Any, view: "LiveView") -> None:
+        self._view, gui = view, server.gui
+        session = view.session
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(40, 100, 200))
+        gui.set_panel_label("wbc-bench live")
+        self._state = gui.add_markdown("")
+        self._message = gui.add_markdown("", visible=False)
+        self._charts = [
+            _add_chart(gui, "position error [cm]", POSITION_COLOUR),
+            _add_chart(gui, "orientation error [deg]", ORIENTATION_COLOUR),
+        ]
+        self._pause = gui.add_button("Pause")
+        steps = gui.add_button_group("Time", ("single step", "reset"))
+        self._speed = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
+        with gui.add_folder("Goal, in the world"):
+            self._pos = gui.add_vector3("x y z [m]", (0.0, 0.0, 0.0), step=0.01)
+            self._rpy = gui.add_vector3("r p y [deg]", (0.0, 0.0, 0.0), step=1.0)
+        with gui.add_folder("Push"):
+            self._push_speed = gui.add_slider("m/s", min=0.1, max=1.0, step=0.1, initial_value=0.3)
+            pushes = gui.add_button_group("Direction", tuple(PUSHES))
+        with gui.add_folder("Who and what"):
+            specs = sorted({*controllers(), session.spec})
+            self._spec = gui.add_dropdown("Controller", specs, initial_value=session.spec)
+            sources = [*dict.fromkeys([*live_source_names(), session.source_name])]
+            self._source = gui.add_dropdown("Source", sources, initial_value=session.source_name)
+        self._history: deque[tuple[float, float, float]] = deque(
+            maxlen=round(CHART_SECONDS / session.period / CHART_EVERY)
+        )
+        self._steps = 0
+
+        self._pause.on_click(lambda _: view.ask(self._toggle))
+        steps.on_click(
+            lambda event: view.ask(view.restart if event.target.value == "reset" else view.step_once)
+        )
+        self._speed.on_update(lambda _: setattr(view, "speed", float(self._speed.value)))
+        pushes.on_click(lambda event: view.ask(lambda: self._push(event.target.value)))
+        # what the program itself writes into a field has no client
+        for field in (self._pos, self._rpy):
+            field.on_update(lambda event: view.ask(self._typed) if event.client else None)
+        for field in (self._spec, self._source):
+            field.on_update(lambda event: view.ask(self._choose) if event.client else None)
+
+    def begin(self) -> None:
+        """A new episode."""
+        self._history.clear()
+        self._steps = 0
+        moment = self._view.session.moment
+        self.show_goal(moment.target_pos_w, wxyz_from_matrix(moment.target_rot_w))
+        self.record(moment)
+        self.update(float("nan"))
+
+    def record(self, moment: Moment) -> None:
+        """Remember the errors of a step."""
+        if self._steps % CHART_EVERY == 0:
+            errors = moment.position_error * CM, moment.orientation_error * DEG
+            self._history.append((moment.time, *errors))
+        self._steps += 1
+
+    def update(self, real_time_factor: float) -> None:
+        """Show the present state."""
+        session, moment = self._view.session, self._view.session.moment
+        doing = session.status if not session.running else "paused" if self._view.paused else "standing"
+        pace = "–" if np.isnan(real_time_factor) else f"{real_time_factor:.2f} × real time"
+        self._state.content = (
+            f"**{doing}** · {moment.time:.1f} s · {pace}\n\n"
+            f"position **{moment.position_error * CM:.1f} cm** · "
+            f"orientation **{moment.orientation_error * DEG:.1f}°**\n\n"
+            f"sees: {', '.join(sorted(session.controller.info.signals)) or 'nothing'}"
+        )
+        self._pause.label = "Continue" if self._view.paused else "Pause"
+        time, position, orientation = np.array(self._history).T
+        for chart, values in zip(self._charts, (position, orientation), strict=True):
+            chart.data = (time, values)
+
+    def show_goal(self, pos_w: Array, wxyz: Array) -> None:
+        """Write where the gizmo is."""
+        self._pos.value = tuple(float(x) for x in np.round(pos_w, 3))
+        self._rpy.value = tuple(float(x) for x in np.round(rpy_from_matrix(matrix_from_wxyz(wxyz)) * DEG, 1))
+
+    def say(self, text: str) -> None:
+        """One line about what went wrong, or nothing."""
+        self._message.content, self._message.visible = f"⚠ {text}", bool(text)
+
+    def _toggle(self) -> None:
+        self._view.paused = not self._view.paused
+        self.update(float("nan"))
+
+    def _push(self, direction: str) -> None:
+        self._view.session.push(np.array(PUSHES[direction]) * float(self._push_speed.value))
+
+    def _typed(self) -> None:
+        rot_w = matrix_from_rpy(np.array(self._rpy.value) / DEG)
+        self._view.set_goal(np.array(self._pos.value, dtype=float), wxyz_from_matrix(rot_w))
+
+    def _choose(self) -> None:
+        session = self._view.session
+        try:
+            self._view.restart(self._spec.value, self._source.value)
+        finally:
+            self._spec.value, self._source.value = session.spec, session.source_name
+
+
+def _add_chart(gui: Any, title: str, colour: str) -> Any:
+    series = ({"label": "s"}, {"label": title, "stroke": colour, "width": 2})
+    # uPlot wants all of it: from 0 to 1, or to a tenth above what there is
+    lower = {"pad": 0.0, "hard": 0.0, "soft": 0.0, "mode": 1}
+    upper = {"pad": 0.1, "hard": 1e6, "soft": 1.0, "mode": 1}
+    scales = {"x": {"time": False}, "y": {"range": {"min": lower, "max": upper}}}
+    axes = ({"size": 28}, {"size": 40})
+    nothing = np.zeros(1)
+    return gui.add_uplot(
+        *((nothing, nothing), series),
+        **{
+            "title": title,
+            "scales": scales,
+            "axes": axes,
+            "legend": {"show": False},
+            "height": 105,
+            "padding": (8, 16, 0, 0),
+        },
+    )
