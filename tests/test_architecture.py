@@ -30,9 +30,9 @@ CHAINS = (
     ("execution", "metrics", "episodes"),
     ("cli", "track", "sources", "protocol", "robot"),
     ("track", "control_loop", "observation"),
-    ("publish", "tracking", "store"),
+    ("publish", "tracking", "records", "store"),
     ("cli", "demo", "track", "sources"),
-    ("demo", "door_records", "store"),
+    ("demo", "door_records", "records", "store"),
     ("publish", "door_records", "stats"),
 )
 # Numbers are made of records alone: an analysis runs where neither physics nor learning is installed.
@@ -51,6 +51,7 @@ PURE = (
     "episodes",
     "tracking",
     "door_records",
+    "records",
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")
 

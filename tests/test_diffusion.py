@@ -440,7 +440,7 @@ def test_the_packaged_policy_shuts_a_door() -> None:
     source = load_source("diffusion")
     assert isinstance(source, DiffusionSource)
     again = DiffusionSource(source._policy, door, 1)
-    episode = demo.run_door(load_controller("ik", robot), again, door, "nominal", 1, 0)  # pyright: ignore[reportArgumentType]
+    episode = demo.run_door(load_controller("ik", robot), again, door, "nominal", 1, 0)
     assert episode.success and episode.steps == 600
     assert 0.0 < episode.first_closed < 11.0
 

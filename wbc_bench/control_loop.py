@@ -1,5 +1,6 @@
-"""A shard of episodes under one controller, a control step at a time; the targets are the caller's."""
+"""A shard of episodes under one controller, a control step at a time."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,19 @@ class ControlLoop:
         self.active = np.ones(count, dtype=bool)
         self.state: State = self.simulation.state()
         self.observation = self.sensors.observe(0, 0.0, self.state, self.active)
+
+    def run(self) -> Iterator[Taken]:
+        """Step towards the manifest's targets, until all episodes have ended or their time is up.
+
+        Raises: see `advance`.
+        """
+        target = self.sensors.target(self.state)
+        self.reset(target)
+        for _ in range(self._protocol.num_steps):
+            yield self.advance(target)
+            if not self.active.any():
+                return
+            target = self.sensors.target(self.state)
 
     def reset(self, target: Target) -> None:
         """Tell the controller what it begins with."""

@@ -1,9 +1,8 @@
 """Doors pushed shut in closed loop: an expert whose episodes are recorded, and policies that are scored."""
 
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -120,7 +119,6 @@ def evaluate(
     controller = load_controller(spec, load_robot())
     ResultStore(root).probe()
     episodes = list(_run_all(policy, spec, condition, seed, count, workers, progress))
-    commit = provenance.commit()
     return write_doors(
         root,
         episode_table(episodes),
@@ -133,12 +131,7 @@ def evaluate(
         requested=count,
         duration=DURATION,
         closed_below=CLOSED,
-        software_sha256=provenance.software_digest(controller),
-        git_commit=commit.sha,
-        git_dirty=commit.dirty,
-        versions=provenance.versions(),
-        machine=provenance.machine(),
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        **provenance.facts(controller),
     )
 
 
@@ -153,10 +146,10 @@ def _run_all(
 ) -> Iterator[DoorEpisode]:
     """Doors 0 to count - 1 in their order, a worker an episode at a time."""
     jobs = (delayed(_run_one)(policy, spec, condition, seed, k) for k in range(count))
-    parallel = Parallel(n_jobs=workers, return_as="generator")
-    for done, episode in enumerate(parallel(jobs), 1):  # pyright: ignore[reportArgumentType]
+    found: Any = Parallel(n_jobs=workers, return_as="generator")(jobs)
+    for done, episode in enumerate(found, 1):
         progress(done, count)
-        yield episode  # pyright: ignore[reportReturnType]
+        yield episode
 
 
 def _run_one(policy: str | None, spec: str, condition: str, seed: int, number: int) -> DoorEpisode:
@@ -167,11 +160,11 @@ def _run_one(policy: str | None, spec: str, condition: str, seed: int, number: i
 
 def _source(policy: str | None, door: Door, seed: int, number: int) -> SceneSource:
     if policy is None:
-        return ExpertSource(door)  # pyright: ignore[reportReturnType]
+        return ExpertSource(door)
     from wbc_bench.sources.diffusion.source import DiffusionSource
 
     network, _, digest = find_policy(policy)
-    return DiffusionSource(network, door, seed, number, digest)  # pyright: ignore[reportReturnType]
+    return DiffusionSource(network, door, seed, number, digest)
 
 
 def episode_table(episodes: list[DoorEpisode]) -> pd.DataFrame:

@@ -3,7 +3,6 @@
 <root>/doors/<source>/<controller>/<condition>_<seed>/run.json, episodes.parquet
 """
 
-import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,15 +10,12 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from wbc_bench import stats
-from wbc_bench.errors import StoreError
 from wbc_bench.markup import Table
-from wbc_bench.store import folder_name, write_atomic
-from wbc_bench.tracking import STOOD
+from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.tracking import DEG, STOOD
 
-DEG = 180.0 / np.pi  # [deg/rad]
 NONE = "–"
 
 
@@ -60,24 +56,16 @@ def write_doors(root: Path, episodes: pd.DataFrame, **facts) -> Path:
 
     Raises: StoreError when the folder cannot be written.
     """
-    sink = pa.BufferOutputStream()
     table = pa.Table.from_pandas(episodes, preserve_index=False).replace_schema_metadata()
-    pq.write_table(table, sink, compression="zstd", use_dictionary=False)
-    data = sink.getvalue().to_pybytes()
+    data, digest = parquet_of(table)
     record = DoorRecord(
         completed=len(episodes),
-        successes=int(episodes["success"].sum()),  # pyright: ignore[reportArgumentType]
-        episodes_sha256=hashlib.sha256(data).hexdigest(),
+        successes=int(np.asarray(episodes["success"]).sum()),
+        episodes_sha256=digest,
         **facts,
     )
-    name = f"{record.condition}_{record.seed}"
-    folder = root / "doors" / folder_name(record.source) / folder_name(record.controller) / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"cannot create '{folder}': {error.strerror}") from error
-    write_atomic(folder / "episodes.parquet", data)
-    write_atomic(folder / "run.json", msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
+    folder = driven_folder(root, "doors", record)
+    write_record(folder / "run.json", record, folder / "episodes.parquet", data)
     return folder
 
 
@@ -95,14 +83,8 @@ def read_doors(root: Path) -> list[DoorRun]:
 
 def _read(path: Path) -> DoorRun:
     beside = path.with_name("episodes.parquet")
-    try:
-        record = msgspec.json.decode(path.read_bytes(), type=DoorRecord)
-        data = beside.read_bytes()
-    except (OSError, msgspec.MsgspecError) as error:
-        raise StoreError(f"cannot read run '{path}': {error}") from error
-    if hashlib.sha256(data).hexdigest() != record.episodes_sha256:
-        raise StoreError(f"'{beside}' is not what its run.json was written for: another sha256")
-    return DoorRun(record, pq.read_table(pa.BufferReader(data)).to_pandas())
+    record, episodes = read_record(path, DoorRecord, beside, "episodes_sha256")
+    return DoorRun(record, episodes.to_pandas())
 
 
 def door_table(runs: list[DoorRun]) -> Table:
@@ -110,9 +92,10 @@ def door_table(runs: list[DoorRun]) -> Table:
     rows, data = [], []
     for record, episodes in runs:
         rate = stats.wilson(record.successes, record.completed)
-        stood = episodes["outcome"] == STOOD
-        final = episodes["final_angle"][stood] * DEG
-        took = episodes["first_closed"][episodes["success"]]
+        stood = np.asarray(episodes["outcome"] == STOOD)
+        falls = int((~stood).sum())
+        final = pd.Series(episodes["final_angle"][stood] * DEG)
+        took = pd.Series(episodes["first_closed"][episodes["success"]])
         digest = record.policy_sha256
         rows.append(
             (
@@ -122,15 +105,15 @@ def door_table(runs: list[DoorRun]) -> Table:
                 str(record.seed),
                 f"{record.successes}/{record.completed}",
                 f"{rate.low * 100:.1f} to {rate.high * 100:.1f}",
-                str(int((~stood).sum())),  # pyright: ignore[reportArgumentType]
-                *(_cell(value, 1) for value in (final.median(), final.max(), took.median())),  # pyright: ignore[reportArgumentType]
+                str(falls),
+                *(_cell(value, 1) for value in (final.median(), final.max(), took.median())),
             )
         )
         data.append(
             {"source": record.source, "policy_sha256": digest or "", "controller": record.controller}
             | {"condition": record.condition, "seed": record.seed, "requested": record.requested}
             | {"completed": record.completed, "successes": record.successes, "rate": rate.point}
-            | {"wilson_low": rate.low, "wilson_high": rate.high, "falls": int((~stood).sum())}  # pyright: ignore[reportArgumentType]
+            | {"wilson_low": rate.low, "wilson_high": rate.high, "falls": falls}
             | {"final_angle_median_deg": final.median(), "final_angle_max_deg": final.max()}
             | {"first_closed_median_s": took.median()}
         )

@@ -20,12 +20,10 @@ def sample_latents(controller: Controller, protocol: EvalProtocol, rows: Episode
             f"controller '{controller.info.name}' shows no latent: it has no method `latent`"
         )
     loop = ControlLoop(controller, protocol, rows)
-    target = loop.sensors.target(loop.state)
-    loop.reset(target)
     parts = []
-    for step in range(protocol.num_steps):
-        error = np.linalg.norm(loop.state.ee_pos_w - rows.target_pos_w, axis=1)  # (N,) [m]
-        ran = loop.advance(target).ran
+    before = loop.state
+    for step, (ran, *_) in enumerate(loop.run()):
+        error = np.linalg.norm(before.ee_pos_w - rows.target_pos_w, axis=1)  # (N,) [m]
         latent = np.asarray(controller.latent(), dtype=np.float64)
         if latent.ndim != 2 or len(latent) != len(rows):
             raise ControllerError(
@@ -34,7 +32,5 @@ def sample_latents(controller: Controller, protocol: EvalProtocol, rows: Episode
             )
         time = np.full(ran.sum(), step * protocol.control_period)  # [s]
         parts.append((latent[ran], error[ran], rows.episode[ran], time))
-        if not loop.active.any():
-            break
-        target = loop.sensors.target(loop.state)
+        before = loop.state
     return Samples(*map(np.concatenate, zip(*parts, strict=True)))

@@ -174,7 +174,7 @@ def latent_figure(name: str, samples: Samples, found: Separation, seed: int) -> 
     figure = Figure(figsize=(10.0, 4.2))
     left, right, beside = figure.subplots(1, 3, width_ratios=(1, 1, 0.62))
     scatter_phases(left, embed(samples.latent[all_of_them], seed), phase[all_of_them])
-    left.set(title="t-SNE, all episodes", xticks=[], yticks=[], xlabel="no unit, no axis", ylabel="")
+    left.set(title="t-SNE, all episodes", xticks=[], yticks=[], xlabel="Axes without a unit", ylabel="")
     flat = found.axes.shape[1] == 1  # two phases have one axis
     second = samples.time if flat else found.axes[:, 1]
     scatter_phases(right, np.column_stack([found.axes[:, 0], second])[unseen], phase[unseen])

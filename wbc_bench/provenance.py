@@ -7,9 +7,10 @@ import platform
 import re
 import subprocess
 import sys
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 PACKAGE = Path(__file__).parent
 SOURCE_SUFFIXES = (".py", ".toml")
@@ -17,7 +18,8 @@ SOURCE_SUFFIXES = (".py", ".toml")
 BYSTANDERS = frozenset(
     {"protocols", "paper_values", "freeze", "cli", "__main__", "publish", "report", "tables", "plots"}
     | {"markup", "analysis", "stats", "store", "progress", "provenance"}
-    | {"sources", "track", "tracking", "demo", "door_records"}
+    | {"sources", "track", "tracking", "demo", "door_records", "records"}
+    | {"gallery", "workspace", "latents", "introspection", "viewer"}
 )
 
 
@@ -76,6 +78,19 @@ def machine() -> dict[str, str | int | float]:
         "cores": os.cpu_count() or 0,
         "memory_gib": round(memory, 1),
         "system": platform.platform(terse=True),
+    }
+
+
+def facts(controller: object) -> dict[str, Any]:
+    """What a record says of the code, packages, machine and time behind it."""
+    now = commit()
+    return {
+        "software_sha256": software_digest(controller),
+        "git_commit": now.sha,
+        "git_dirty": now.dirty,
+        "versions": versions(),
+        "machine": machine(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
 

@@ -1,7 +1,8 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pandas as pd
@@ -32,7 +33,7 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
     for spec in beside:
         if spec not in known:
             raise UnknownNameError("evaluated controller", spec, known, "--workspace")
-    try:
+    with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
             made = Path(folder)
@@ -46,8 +47,6 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
                 for path in sorted(made.rglob("*"))
                 if path.is_file()
             ]
-    except OSError as error:
-        raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
 
 
 def publish_tracks(root: Path, out: Path) -> list[Path]:
@@ -55,10 +54,8 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
 
     Raises: StoreError when a track cannot be read or the folder cannot be written.
     """
-    try:
+    with _writing(out):
         return _write_tracks(tracking.read_tracks(root), out)
-    except OSError as error:
-        raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
 
 
 def publish_doors(root: Path, out: Path) -> list[Path]:
@@ -66,8 +63,14 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
 
     Raises: StoreError when a run cannot be read or the folder cannot be written.
     """
-    try:
+    with _writing(out):
         return _write_doors(door_records.read_doors(root), out)
+
+
+@contextmanager
+def _writing(out: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
 

@@ -37,12 +37,9 @@ def evaluate(
     steps = np.zeros(count, dtype=np.int64)
     infeasible = np.zeros((count, num_steps), dtype=bool)
 
-    target = loop.sensors.target(loop.state)
-    loop.reset(target)
     if watch is not None:
         watch(loop)
-    for step in range(num_steps):
-        ran, q, stuck = loop.advance(target)
+    for step, (ran, q, stuck) in enumerate(loop.run()):
         if not ran.any():
             break
         if watch is not None:
@@ -55,9 +52,6 @@ def evaluate(
         position_error[ran, step] = np.linalg.norm(state.ee_pos_w - rows.target_pos_w, axis=1)[ran]
         orientation_error[ran, step] = geodesic_angle(state.ee_rot_w, target_rot_w)[ran]
         ee_pos_w[ran, step] = state.ee_pos_w[ran]
-        if not loop.active.any():
-            break
-        target = loop.sensors.target(state)
 
     window = protocol.window_steps
     inside = (position_error < protocol.success.position) & (orientation_error < protocol.success.orientation)

@@ -4,7 +4,6 @@ import dataclasses
 import math
 import time as clocks
 from collections.abc import Callable
-from datetime import UTC, datetime
 from typing import NamedTuple
 
 import msgspec
@@ -153,7 +152,6 @@ def _digest(source: Source) -> str | None:
 
 def facts(controller: Controller, spec: str, source: Source, condition: str, seed: int) -> dict:
     """What the record of a run says beside its series."""
-    commit = provenance.commit()
     return {
         "source": source.name,
         "source_sha256": _digest(source),
@@ -162,12 +160,7 @@ def facts(controller: Controller, spec: str, source: Source, condition: str, see
         "condition": condition,
         "seed": seed,
         "counters": dict(source.counters),
-        "software_sha256": provenance.software_digest(controller),
-        "git_commit": commit.sha,
-        "git_dirty": commit.dirty,
-        "versions": provenance.versions(),
-        "machine": provenance.machine(),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        **provenance.facts(controller),
     }
 
 

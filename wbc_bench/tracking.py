@@ -3,7 +3,6 @@
 <root>/tracks/<source>/<controller>/<condition>_<seed>/track.json, series.parquet
 """
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -12,13 +11,11 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from wbc_bench.errors import StoreError
 from wbc_bench.markup import Table
 from wbc_bench.metrics import spectral_arc_length
-from wbc_bench.store import folder_name, write_atomic
+from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
 
 Array = NDArray[np.float64]
 STOOD = "stood"  # the outcome of a run to its end; otherwise one of episodes.TERMINATED
@@ -157,25 +154,16 @@ def write_track(root: Path, tracked: Tracked, **facts) -> Path:
         "position_error": tracked.position_error,
         "orientation_error": tracked.orientation_error,
     }
-    sink = pa.BufferOutputStream()
-    pq.write_table(pa.table(columns), sink, compression="zstd", use_dictionary=False)
-    data = sink.getvalue().to_pybytes()
+    data, digest = parquet_of(pa.table(columns))
     record = TrackRecord(
         completed_s=round(len(tracked.position_error) * tracked.control_period, 9),
         outcome=tracked.outcome,
         control_period=tracked.control_period,
-        series_sha256=hashlib.sha256(data).hexdigest(),
+        series_sha256=digest,
         **facts,
     )
-    name = f"{record.condition}_{record.seed}"
-    folder = root / "tracks" / folder_name(record.source) / folder_name(record.controller) / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StoreError(f"cannot create '{folder}': {error.strerror}") from error
-    write_atomic(folder / "series.parquet", data)
-    text = msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n"
-    write_atomic(folder / "track.json", text)
+    folder = driven_folder(root, "tracks", record)
+    write_record(folder / "track.json", record, folder / "series.parquet", data)
     return folder
 
 
@@ -193,15 +181,8 @@ def _key(record: TrackRecord) -> tuple[str, str, str, int]:
 
 
 def _read(path: Path) -> Track:
-    series = path.with_name("series.parquet")
-    try:
-        record = msgspec.json.decode(path.read_bytes(), type=TrackRecord)
-        data = series.read_bytes()
-    except (OSError, msgspec.MsgspecError) as error:
-        raise StoreError(f"cannot read track '{path}': {error}") from error
-    if hashlib.sha256(data).hexdigest() != record.series_sha256:
-        raise StoreError(f"'{series}' is not what its track.json was written for: another sha256")
-    frame = pq.read_table(pa.BufferReader(data)).to_pandas()
+    record, series = read_record(path, TrackRecord, path.with_name("series.parquet"), "series_sha256")
+    frame = series.to_pandas()
 
     def columns(*names: str) -> Array:
         return frame[list(names)].to_numpy(dtype=float)

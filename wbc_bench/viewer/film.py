@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 from wbc_bench.errors import BenchError, StoreError
 from wbc_bench.robot.picture import Canvas, add_axes, add_bones, add_connector
-from wbc_bench.store import Run
+from wbc_bench.tables import CM, DEG
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
-from wbc_bench.viewer.rerun import Rerun, ShowProgress, rerun
+from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress
 
 Pixels = NDArray[np.uint8]
-EVERY = 2  # control steps a picture: 25 a second, in real time
 SIZE, PANEL = (640, 480), (300, 400)  # [px] width, height of a film, of a picture in a strip
 PANELS, GAP = 6, 4  # pictures in a strip; [px] between them
-CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
 INSIDE, OUTSIDE = (0.14, 0.59, 0.35, 0.4), (0.89, 0.50, 0.12, 0.4)  # of the tolerance, around the target
 TRAIL, FORCE, PUSH = (0.16, 0.39, 0.78, 1.0), (0.17, 0.59, 0.59, 1.0), (0.82, 0.20, 0.43, 1.0)
 SUPPORT, COM = (0.35, 0.67, 0.90, 1.0), (0.09, 0.14, 0.25, 1.0)
@@ -31,24 +29,11 @@ AZIMUTH, ELEVATION = 218.0, -14.0  # [deg]
 MARGIN = 0.22  # [m] around what must be seen: half the width of a part, and the labels
 
 
-def write_film(
-    run: Run,
-    episode: int,
-    path: Path,
-    protocol_name: str | None = None,
-    progress: ShowProgress | None = None,
-) -> Rerun:
-    """Run an episode of a stored run again and write it as MP4, in real time.
-
-    Raises: see `rerun`; BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
-    """
-    again = rerun(run, episode, protocol_name, progress)
-    write_film_of(again, path, progress)
-    return again
-
-
 def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None) -> None:
-    """The film of an episode that has been run again."""
+    """Write an episode that has been run again as MP4, in real time.
+
+    Raises: BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
+    """
     try:
         from imageio_ffmpeg import write_frames
     except ImportError as error:
@@ -79,27 +64,15 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
         part.unlink(missing_ok=True)
 
 
-def strip(
-    run: Run,
-    episode: int,
-    times: Sequence[float] | None = None,
-    protocol_name: str | None = None,
-    progress: ShowProgress | None = None,
-) -> Pixels:
-    """Pictures side by side, (400, W, 3), at `times` [s]; by default six, evenly from the start to the end.
-
-    Raises: see `rerun`; BenchError without OpenGL.
-    """
-    return strip_of(rerun(run, episode, protocol_name, progress), times)
-
-
 def strip_of(again: Rerun, times: Sequence[float] | None = None) -> Pixels:
-    """The strip of an episode that has been run again; a time beyond its end shows its end."""
+    """Pictures of an episode side by side, (400, W, 3), at `times` [s]: by default six, evenly over it.
+
+    A time beyond the end shows the end. Raises: BenchError without OpenGL.
+    """
     clock = np.array([moment.time for moment in again.moments])
-    if times is None:
-        times = np.linspace(0.0, clock[-1], PANELS).tolist()
+    at = np.linspace(0.0, clock[-1], PANELS).tolist() if times is None else times
     with Camera(again, PANEL, samples=4) as camera:
-        pictures = [camera.picture(int(np.abs(clock - time).argmin())) for time in times]  # pyright: ignore[reportOptionalIterable]
+        pictures = [camera.picture(int(np.abs(clock - time).argmin())) for time in at]
     gap = np.full((PANEL[1], GAP, 3), 255, dtype=np.uint8)
     return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
 

@@ -7,13 +7,13 @@ import numpy as np
 
 from wbc_bench.controller import controllers
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, rpy_from_matrix, wxyz_from_matrix
+from wbc_bench.tables import CM, DEG
 from wbc_bench.viewer.moment import Array, Moment
 from wbc_bench.viewer.session import live_source_names
 
 if TYPE_CHECKING:
     from wbc_bench.viewer.live import LiveView
 
-CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
 CHART_SECONDS, CHART_EVERY = 10.0, 5  # [s], control steps a point
 POSITION_COLOUR, ORIENTATION_COLOUR = "#2864c8", "#b0446e"
 PUSHES = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}  # world x, y

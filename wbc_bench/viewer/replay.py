@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from wbc_bench.store import Run, write_atomic
-from wbc_bench.viewer.rerun import Rerun, ShowProgress, rerun
+from wbc_bench.tables import CM, DEG
+from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress, rerun
 from wbc_bench.viewer.scene import Scene, serving
 
-EVERY = 2  # control steps a picture: 25 a second
-CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
 CHART = (370, 48)  # [px] width, height of the error chart
 
 

@@ -21,6 +21,7 @@ from wbc_bench.store import Run
 from wbc_bench.viewer.moment import PUSH_SECONDS, Moment, moment_of
 
 Row = dict[str, Any]
+EVERY = 2  # control steps a picture of a film or a replay: 25 a second
 ShowProgress = Callable[[int, int, str], None]
 
 
@@ -104,14 +105,16 @@ def rerun(
     stored = run.episodes().iloc[[place]].to_dict("records")[0]
     robot = load_robot(protocol.robot)
     spec = spec_of_replicate(record.controller, record.replicate)
-    for part in dict.fromkeys([(place, place + 1), (shard.start, shard.stop)]):
-        chosen = rows.take(slice(*part))
-        moments, table = _watched(spec, robot, protocol, chosen, place - part[0], progress)
-        again = table.slice(place - part[0], 1).to_pylist()[0]
-        result = Rerun(run, protocol, robot, episode, stored, again, moments)
-        if not result.differences or record.machine.get("processor") != machine().get("processor"):
-            break
-    return result  # pyright: ignore[reportPossiblyUnboundVariable]
+
+    def of(part: slice) -> Rerun:
+        row = place - part.start
+        moments, table = _watched(spec, robot, protocol, rows.take(part), row, progress)
+        return Rerun(run, protocol, robot, episode, stored, table.slice(row, 1).to_pylist()[0], moments)
+
+    alone = of(slice(place, place + 1))
+    elsewhere = record.machine.get("processor") != machine().get("processor")
+    whole = shard.stop - shard.start == 1
+    return alone if not alone.differences or elsewhere or whole else of(shard)
 
 
 def _watched(

@@ -6,7 +6,7 @@ the states are those a policy meets and not only those a teacher leaves behind. 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -120,17 +120,13 @@ def record(
 
     Targets come from training's pool and draws from streams of training's own, so no evaluation meets them.
     """
-    tasks = range(-(-episodes // SHARD))
-    student_state = student.state_dict() if student else None
-    parts, found = (
-        [],
-        Parallel(n_jobs=workers, return_as="generator")(
-            delayed(_record_shard)(
-                spec, protocol, pool, seed, k, min(SHARD, episodes - k * SHARD), student_state, share
-            )
-            for k in tasks
-        ),
+    state = student.state_dict() if student else None
+    jobs = (
+        delayed(_record_shard)(spec, protocol, pool, seed, k, min(SHARD, episodes - first), state, share)
+        for k, first in enumerate(range(0, episodes, SHARD))
     )
+    parts: list[Lessons] = []
+    found: Any = Parallel(n_jobs=workers, return_as="generator")(jobs)
     for part in found:
         parts.append(part)
         progress(min(len(parts) * SHARD, episodes), episodes)
@@ -155,14 +151,8 @@ def _record_shard(
     robot, rows = load_robot(protocol.robot), draw_rows(protocol, pool, count, rng)
     drives = torch.from_numpy(rng.random(count) < share)
     pupil = Pupil(robot, protocol, load_controller(spec, robot), student, drives)
-    loop = ControlLoop(pupil, protocol, rows)
-    target = loop.sensors.target(loop.state)
-    loop.reset(target)
-    for _ in range(protocol.num_steps):
-        loop.advance(target)
-        if not loop.active.any():
-            break
-        target = loop.sensors.target(loop.state)
+    for _ in ControlLoop(pupil, protocol, rows).run():
+        pass  # the pupil keeps what is wanted
     return Lessons.joined(pupil.lessons)
 
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from wbc_bench.robot import Scene
 from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.sources.diffusion.scene import STANDOFF, Door, DoorScene
 from wbc_bench.sources.interface import Seen, StampedTarget
@@ -39,8 +40,9 @@ class ExpertSource:
     live = False
 
     def __init__(self, door: Door) -> None:
-        self.name, self.door, self.scene = "door-expert", door, DoorScene(door)
-        self.digest = None
+        self.name, self.door = "door-expert", door
+        self.digest: str | None = None
+        self.scene: Scene = DoorScene(door)
         self.counters: Mapping[str, int] = {}
 
     def look(self, scenery: Array) -> None:

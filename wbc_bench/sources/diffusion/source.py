@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from wbc_bench.randomness import stream
+from wbc_bench.robot import Scene
 from wbc_bench.rotations import matrix_from_rotvec, rotvec_from_matrix, wxyz_from_matrix
 from wbc_bench.sources.diffusion import poses
 from wbc_bench.sources.diffusion.demonstrations import GRIPPER_WIDTH, door_state
@@ -30,7 +31,8 @@ class DiffusionSource:
     def __init__(
         self, policy: Policy, door: Door, seed: int, episode: int = 0, digest: str | None = None
     ) -> None:
-        self.name, self.scene, self.digest = "diffusion", DoorScene(door), digest
+        self.name, self.door, self.digest = "diffusion", door, digest
+        self.scene: Scene = DoorScene(door)
         self.counters: Mapping[str, int] = {}
         self._policy, self._key = policy, (seed, episode)
 
@@ -61,7 +63,7 @@ class DiffusionSource:
 
     def _remember(self, time: float, seen: Seen) -> None:
         hand = Pose(seen.ee_pos_w, seen.ee_rot_w)
-        panel = self.scene.door.panel(self._angle)
+        panel = self.door.panel(self._angle)
         self._looks.append((time, poses.tool(hand), door_state(panel, np.array(self._angle), hand)))
         # of the looks that are old enough, the youngest is the one that a plan needs
         while len(self._looks) > 1 and self._looks[1][0] <= time - PERIOD + 1e-9:

@@ -1,0 +1,71 @@
+"""A run that is kept as two files: its data as parquet, and a JSON record of what was run."""
+
+import hashlib
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import msgspec
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from wbc_bench.errors import StoreError
+from wbc_bench.store import folder_name, write_atomic
+
+
+class Driven(Protocol):
+    """What a record says of a controller that a source of targets drove."""
+
+    @property
+    def source(self) -> str: ...
+    @property
+    def controller(self) -> str: ...
+    @property
+    def condition(self) -> str: ...
+    @property
+    def seed(self) -> int: ...
+
+
+Record = TypeVar("Record", bound=msgspec.Struct)
+
+
+def parquet_of(table: pa.Table) -> tuple[bytes, str]:
+    """A table as the bytes of a parquet file, and their SHA-256."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", use_dictionary=False)
+    data = sink.getvalue().to_pybytes()
+    return data, hashlib.sha256(data).hexdigest()
+
+
+def driven_folder(root: Path, kind: str, record: Driven) -> Path:
+    """<root>/<kind>/<source>/<controller>/<condition>_<seed>"""
+    name = f"{record.condition}_{record.seed}"
+    return root / kind / folder_name(record.source) / folder_name(record.controller) / name
+
+
+def write_record(path: Path, record: msgspec.Struct, beside: Path, data: bytes) -> None:
+    """Write the data, and after it the record that says whose they are.
+
+    Raises: StoreError when the folder cannot be written.
+    """
+    folder = path.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"cannot create '{folder}': {error.strerror}") from error
+    write_atomic(beside, data)
+    write_atomic(path, msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
+
+
+def read_record(path: Path, kind: type[Record], beside: Path, digest: str) -> tuple[Record, pa.Table]:
+    """A record, and the data beside it, whose SHA-256 stands in its field `digest`.
+
+    Raises: StoreError when one cannot be read or the data are not those it was written with.
+    """
+    try:
+        record = msgspec.json.decode(path.read_bytes(), type=kind)
+        data = beside.read_bytes()
+    except (OSError, msgspec.MsgspecError) as error:
+        raise StoreError(f"cannot read the record '{path}': {error}") from error
+    if hashlib.sha256(data).hexdigest() != getattr(record, digest):
+        raise StoreError(f"'{beside}' is not what its {path.name} was written for: another sha256")
+    return record, pq.read_table(pa.BufferReader(data))
