@@ -10,10 +10,15 @@ import pytest
 
 from wbc_bench.errors import BenchError, SourceError, UnknownNameError
 from wbc_bench.sources.slew import Limits
-from wbc_bench.viewer.session import Session
+from wbc_bench.track import episode_of, free_episode
+from wbc_bench.tracking import STOOD
+from wbc_bench.viewer.session import LONGEST, Session
 
-ASKED = ("ik", "live", "ablation_v1", "nominal", 0)
 AWAY = np.array([0.06, -0.08, 0.04])  # [m] from the hand, within reach of the arm
+
+
+def session_of(spec: str, source: str, condition: str = "nominal", seed: int = 0) -> Session:
+    return Session(spec, source, *free_episode("ablation_v1", condition, seed, LONGEST))
 
 
 def seconds(session: Session, duration: float) -> None:
@@ -22,7 +27,7 @@ def seconds(session: Session, duration: float) -> None:
 
 
 def test_the_hand_stays_until_it_is_told_and_then_follows() -> None:
-    session = Session(*ASKED)
+    session = session_of("ik", "live")
     start = session.moment
     seconds(session, 1.0)
     assert session.moment.position_error < 0.01 and session.status == "standing"
@@ -36,7 +41,7 @@ def test_the_hand_stays_until_it_is_told_and_then_follows() -> None:
 
 
 def test_the_same_steps_give_the_same_bits_and_a_restart_forgets() -> None:
-    session = Session("ik", "figure_eight", "ablation_v1", "randomised", 3)
+    session = session_of("ik", "figure_eight", "randomised", 3)
     seconds(session, 0.5)
     first = session.moment
     session.restart()
@@ -46,7 +51,7 @@ def test_the_same_steps_give_the_same_bits_and_a_restart_forgets() -> None:
 
 
 def test_a_push_is_felt_and_seen() -> None:
-    session = Session("hold", *ASKED[1:])
+    session = session_of("hold", "live")
     before = session.moment.qpos[:2].copy()
     session.push(np.array([0.0, 0.5]))
     session.step()
@@ -58,7 +63,7 @@ def test_a_push_is_felt_and_seen() -> None:
 
 
 def test_it_ends_with_a_fall_and_goes_on_after_a_restart() -> None:
-    session = Session("hold", *ASKED[1:])
+    session = session_of("hold", "live")
     for _ in range(4):
         session.push(np.array([2.0, 0.0]))
         seconds(session, 0.5)
@@ -72,7 +77,7 @@ def test_it_ends_with_a_fall_and_goes_on_after_a_restart() -> None:
 
 
 def test_what_cannot_be_loaded_changes_nothing() -> None:
-    session = Session("hold", *ASKED[1:])
+    session = session_of("hold", "live")
     seconds(session, 0.1)
     for change in ({"spec": "holt"}, {"source": "figure_nine"}):
         with pytest.raises(UnknownNameError, match="did you mean"):
@@ -81,7 +86,21 @@ def test_what_cannot_be_loaded_changes_nothing() -> None:
     with pytest.raises(SourceError, match="finite"):
         session.set_goal(np.array([np.nan, 0, 0]), np.array([1.0, 0, 0, 0]))
     with pytest.raises(UnknownNameError, match="condition"):
-        Session("hold", "live", "ablation_v1", "perturbed", 0)
+        session_of("hold", "live", "perturbed")
+
+
+def test_a_door_is_seen_by_its_policy_and_drawn() -> None:
+    pytest.importorskip("torch")
+    session = session_of("hold", "live")
+    assert session.surroundings is None and len(session.moment.scenery) == 0
+    session.restart(source="diffusion")
+    (angle,) = session.moment.scenery
+    assert 0.3 < angle < 0.9  # [rad] as doors are drawn
+    hand = session.moment.ee_pos_w
+    seconds(session, 0.5)
+    assert np.linalg.norm(session.moment.target_pos_w - hand) > 0.01  # the policy has set off
+    session.restart(source="live")
+    assert session.surroundings is None and len(session.moment.scenery) == 0
 
 
 # --- the page -------------------------------------------------------------------------------------------
@@ -100,13 +119,13 @@ class Served:
         from wbc_bench.viewer.live import LiveView
         from wbc_bench.viewer.scene import serving
 
-        self.session, self._stop, self._ready = Session(*ASKED), threading.Event(), threading.Event()
+        self.session, self._stop, self._ready = session_of("ik", "live"), threading.Event(), threading.Event()
 
         def run() -> None:
             with serving(port=free_port()) as self.server:
                 self.view = LiveView(self.server, self.session)
                 self._ready.set()
-                self.view.run(self._stop)
+                self.view.run(self._stop.is_set)
 
         self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
@@ -147,6 +166,50 @@ def test_the_gizmo_sets_the_target_and_the_field_shows_it(served: Served) -> Non
     wait_for(lambda: session.moment.time < 5.0, 20, "a new episode")
 
 
+def test_the_time_of_a_scored_run_begins_with_the_first_drag() -> None:
+    pytest.importorskip("viser")
+    from wbc_bench.viewer.live import LiveView
+    from wbc_bench.viewer.scene import serving
+
+    session, stop = Session("ik", "live", *episode_of(1.0, 0, "nominal")), threading.Event()
+    with serving(port=free_port()) as server:
+        view = LiveView(server, session)
+        view.wait()
+        thread = threading.Thread(target=view.run, args=(lambda: stop.is_set() or not session.running,))
+        thread.start()
+        time.sleep(0.3)
+        assert session.moment.time == 0.0 and "waiting" in view.panel._state.content
+        view.gizmo.position = session.moment.ee_pos_w + AWAY
+        view._goal_moved()  # what viser calls after a drag
+        thread.join(30)
+        stop.set()
+    tracked = session.tracked
+    assert tracked.outcome == STOOD and len(tracked.position_error) == 50
+    distance = np.linalg.norm(tracked.target_pos_w - tracked.ee_pos_w, axis=1)
+    assert np.allclose(tracked.position_error, distance)
+    assert np.linalg.norm(tracked.target_pos_w[-1] - tracked.target_pos_w[0] - AWAY) < 1e-6
+
+
+def test_a_scene_is_drawn_with_what_surrounds_the_robot() -> None:
+    pytest.importorskip("viser")
+    pytest.importorskip("torch")
+    from wbc_bench.viewer.live import LiveView
+    from wbc_bench.viewer.scene import serving
+
+    with serving(port=free_port()) as server:
+        session = session_of("hold", "live")
+        view = LiveView(server, session)
+        bare = set(server.scene._handle_from_node_name)
+        view.restart(source="diffusion")
+        furnished = set(server.scene._handle_from_node_name)
+        added = {name for name in furnished - bare if "trail" not in name}
+        assert {"/body/cabinet", "/body/cabinet/cabinet", "/body/door", "/body/door/door"} <= added
+        view.restart(source="live")
+        assert {name for name in server.scene._handle_from_node_name if "/body/" in name} == {
+            name for name in bare if "/body/" in name
+        }
+
+
 def test_a_port_that_is_taken_is_refused() -> None:
     pytest.importorskip("viser")
     from wbc_bench.viewer.live import serve
@@ -156,4 +219,4 @@ def test_a_port_that_is_taken_is_refused() -> None:
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(BenchError, match=f"port {port} is in use"):
-            serve("127.0.0.1", port, ("hold", *ASKED[1:]), print)
+            serve("127.0.0.1", port, session_of("hold", "live"), print)

@@ -131,7 +131,7 @@ def test_the_support_polygon_is_that_of_the_soles_that_stand(run: Run) -> None:
     again = rerun(run, 3)
     skeleton = Skeleton(again.robot.model())
     moment: Moment = again.moments[0]
-    skeleton.place(moment.qpos)
+    skeleton.place(moment)
     up = np.array([0.0, 0.0, 100.0])
     both = skeleton.support(np.stack([up, up]))
     left = skeleton.support(np.stack([up, np.zeros(3)]))

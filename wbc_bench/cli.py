@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from wbc_bench.execution import Engine
     from wbc_bench.robot import Robot, RobotConfig
     from wbc_bench.store import ResultStore
+    from wbc_bench.tracking import Tracked
 
 # One thread a worker, whatever a library would like: set before numpy is loaded, inherited by workers.
 THREADS = {
@@ -179,35 +180,38 @@ class Track:
     controller: tuple[str, ...] = tyro.MISSING
     """Controllers: name, name:variant, module:attribute or file.py:attribute."""
     source: tuple[str, ...] = tyro.MISSING
-    """Sources: a script of the library, a .toml file, `stream`, `stream:SCRIPT` to send one through it, or
-    `diffusion[:FILE]`, a policy in front of a door."""
+    """Sources: a script of the library, a .toml file, `stream`, `stream:SCRIPT` to send one through it,
+    `diffusion[:FILE]`, a policy in front of a door, or `live`, a person who drags the target in a page."""
     duration: float | None = None
-    """Seconds; until the script ends when not given, 20 for a stream."""
+    """Seconds; until the script ends when not given, 20 for other sources."""
     seed: int = 0
     """Of the draws of a randomised episode, and of the door."""
     condition: str = "nominal"
     """nominal, or randomised: friction, mass, gains, reset state, pushes and noise of ablation_v1."""
     address: str = "tcp://127.0.0.1:5601"
     """Where a stream listens."""
+    port: int = 8080
+    """Of the page of `live`."""
     allow_remote: FlagCreatePairsOff[bool] = False
-    """Let a stream listen where other machines can reach it."""
+    """Let other machines reach the stream or the page, and move the robot."""
     out: Path = Path("results")
     """Folder of records, table and figure."""
 
     def run(self) -> None:
         from wbc_bench.controller import load_controller
-        from wbc_bench.errors import SourceError
         from wbc_bench.publish import publish_tracks
         from wbc_bench.robot import load_robot
-        from wbc_bench.sources.library import check_source, load_source
+        from wbc_bench.sources.library import check_source
+        from wbc_bench.sources.live import LIVE
         from wbc_bench.store import ResultStore
-        from wbc_bench.track import CONDITIONS, door_protocol, facts, track
+        from wbc_bench.track import CONDITIONS
         from wbc_bench.tracking import read_tracks, tracking_table, write_track
 
         for option, given in (("--controller", self.controller), ("--source", self.source)):
             if not given:
                 raise UsageError(f"{option}: give at least one")
         _not_negative("--seed", self.seed)
+        _check_port(self.port)
         if self.condition not in CONDITIONS:
             raise UnknownNameError("condition", self.condition, CONDITIONS, "--condition")
         for name in self.source:
@@ -217,24 +221,48 @@ class Track:
         ResultStore(self.out).probe()
         for name in dict.fromkeys(self.source):
             for spec in dict.fromkeys(self.controller):
-                controller = load_controller(spec, load_robot())
-                source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))
-                if self.allow_remote and source.live:
-                    print(
-                        f"listening on {self.address}: whoever can send there moves the robot",
-                        file=sys.stderr,
-                    )
-                try:
-                    tracked, asked = track(controller, source, self.condition, self.seed, self.duration)
-                except SourceError as error:
-                    raise UsageError(f"--source {name}: {error}") from error
-                finally:
-                    source.close()
-                what = facts(controller, spec, source, self.condition, self.seed)
-                write_track(self.out, tracked, requested_s=asked, **what)
+                tracked, facts = self._drag(spec) if name == LIVE else self._play(name, spec)
+                write_track(self.out, tracked, **facts)
         publish_tracks(self.out, self.out)
         _print_table(tracking_table(read_tracks(self.out)))
         print(f"record, table and figure are under {self.out}")
+
+    def _play(self, name: str, spec: str) -> "tuple[Tracked, dict]":
+        """Let a controller follow a source of a name; the series, and what the record says beside it."""
+        from wbc_bench.controller import load_controller
+        from wbc_bench.errors import SourceError
+        from wbc_bench.robot import load_robot
+        from wbc_bench.sources.library import load_source
+        from wbc_bench.track import door_protocol, facts, track
+
+        controller = load_controller(spec, load_robot())
+        source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))
+        if self.allow_remote and source.live:
+            print(f"listening on {self.address}: whoever can send there moves the robot", file=sys.stderr)
+        try:
+            tracked, asked = track(controller, source, self.condition, self.seed, self.duration)
+        except SourceError as error:
+            raise UsageError(f"--source {name}: {error}") from error
+        finally:
+            source.close()
+        return tracked, facts(controller, spec, source, self.condition, self.seed) | {"requested_s": asked}
+
+    def _drag(self, spec: str) -> "tuple[Tracked, dict]":
+        """Let a controller follow what a person drags in a page; as `_play`."""
+        from wbc_bench.sources.live import LIVE
+        from wbc_bench.track import UNSCRIPTED, episode_of, facts
+        from wbc_bench.viewer.live import serve
+        from wbc_bench.viewer.session import Session
+
+        asked = UNSCRIPTED if self.duration is None else self.duration
+        session = Session(spec, LIVE, *episode_of(asked, self.seed, self.condition))
+
+        def ready(url: str) -> None:
+            print(f"{url}: drag the target there; {asked:g} s from the first drag on are scored", flush=True)
+
+        serve(_host(self.allow_remote), self.port, session, ready, once=True)
+        what = facts(session.controller, spec, session.source, self.condition, self.seed)
+        return session.tracked, what | {"requested_s": asked}
 
 
 @dataclass(frozen=True)
@@ -257,16 +285,20 @@ class Live:
     """Let other machines open the page, and move the robot."""
 
     def run(self) -> None:
+        from wbc_bench.track import free_episode
         from wbc_bench.viewer.live import serve
+        from wbc_bench.viewer.session import LONGEST, Session
 
-        if not 0 < self.port < 1 << 16:
-            raise UsageError(f"--port {self.port}: valid: 1 to 65535")
-        if self.seed < 0:
-            raise UsageError(f"--seed {self.seed}: valid: 0 or more")
-        host = "0.0.0.0" if self.allow_remote else "127.0.0.1"
-        asked = self.controller, self.source, self.protocol, self.condition, self.seed
+        _check_port(self.port)
+        _not_negative("--seed", self.seed)
+        episode = free_episode(self.protocol, self.condition, self.seed, LONGEST)
+        session = Session(self.controller, self.source, *episode)
+
+        def ready(url: str) -> None:
+            print(f"{url}  (Ctrl-C ends it)", flush=True)
+
         try:
-            serve(host, self.port, asked, lambda url: print(f"{url}  (Ctrl-C ends it)", flush=True))
+            serve(_host(self.allow_remote), self.port, session, ready)
         except KeyboardInterrupt:
             print()
 
@@ -872,6 +904,15 @@ def _at_least_one(option: str, value: int) -> None:
 def _not_negative(option: str, value: int) -> None:
     if value < 0:
         raise UsageError(f"{option} {value}: valid: 0 or more")
+
+
+def _check_port(port: int) -> None:
+    if not 0 < port < 1 << 16:
+        raise UsageError(f"--port {port}: valid: 1 to 65535")
+
+
+def _host(allow_remote: bool) -> str:
+    return "0.0.0.0" if allow_remote else "127.0.0.1"
 
 
 def _within(option: str, value: int | None, most: int, what: str) -> int:

@@ -19,12 +19,11 @@ from wbc_bench.observation import target_in_base
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.randomization import draw, undisturbed
 from wbc_bench.robot import Robot, load_robot, mount_of
-from wbc_bench.rotations import geodesic_angle
 from wbc_bench.simulation import Simulation, State
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
 from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import ScriptedSource
-from wbc_bench.tracking import STOOD, Tracked
+from wbc_bench.tracking import STOOD, Series, Tracked
 
 Array = NDArray[np.float64]
 CONDITIONS = ("nominal", "randomised")
@@ -49,10 +48,7 @@ def track(
         raise UnknownNameError("condition", condition, CONDITIONS, "--condition")
     if duration is None:
         duration = natural_duration(source)
-    protocol = _protocol(duration, seed)
-    if not math.isfinite(duration) or protocol.num_steps < 1:
-        raise SourceError(f"duration {duration:g} s, valid: {protocol.control_period:g} s or more")
-    return follow(controller, source, protocol, _row(protocol, condition)), duration
+    return follow(controller, source, *episode_of(duration, seed, condition)), duration
 
 
 class Moment(NamedTuple):
@@ -83,8 +79,7 @@ def follow(
     if furnished:
         furnished.look(scenery)
     source.reset(seen)
-    target_pos_w, ee_pos_w, position, orientation = [], [], [], []
-    start = clocks.monotonic()
+    series, start = Series(period), clocks.monotonic()
     for step in range(protocol.num_steps):
         if source.live:
             clocks.sleep(max(0.0, start + step * period - clocks.monotonic()))
@@ -97,22 +92,17 @@ def follow(
         if not loop.advance(target).ran.any():
             break
         watch(Moment(seen, pos_w, rot_w, scenery))
-        target_pos_w.append(pos_w)
-        ee_pos_w.append(seen.ee_pos_w)
-        position.append(np.linalg.norm(seen.ee_pos_w - pos_w))
-        orientation.append(geodesic_angle(seen.ee_rot_w, rot_w))
+        series.add(pos_w, rot_w, seen.ee_pos_w, seen.ee_rot_w)
         if not loop.active.any():
             break
         seen, scenery = seen_of(loop.state, robot), loop.simulation.scenery[0]
+    return series.tracked(outcome_of(loop))
+
+
+def outcome_of(loop: ControlLoop) -> str:
+    """How the one episode of a loop has ended so far."""
     ended = loop.ended[0]
-    return Tracked(
-        control_period=period,
-        outcome=STOOD if ended == RUNNING else str(ended),
-        target_pos_w=np.reshape(target_pos_w, (-1, 3)),
-        ee_pos_w=np.reshape(ee_pos_w, (-1, 3)),
-        position_error=np.array(position, dtype=float),
-        orientation_error=np.array(orientation, dtype=float),
-    )
+    return STOOD if ended == RUNNING else str(ended)
 
 
 def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
@@ -167,7 +157,10 @@ def facts(controller: Controller, spec: str, source: Source, condition: str, see
 def episode_of(
     duration: float, seed: int, condition: str, episode: int = 0
 ) -> tuple[EvalProtocol, EpisodeManifest]:
-    """An episode of `duration` [s] without a target, and the protocol it is of."""
+    """An episode of `duration` [s] without a target, and the protocol it is of.
+
+    Raises: SourceError when it would last less than a control step, or for ever.
+    """
     protocol = _protocol(duration, seed)
     return protocol, _row(protocol, condition, episode)
 
@@ -189,6 +182,8 @@ def free_episode(
 
 def _protocol(duration: float, seed: int, base: str = BASE_PROTOCOL) -> EvalProtocol:
     protocol, _ = find_protocol(base)
+    if not math.isfinite(duration) or duration < protocol.control_period:
+        raise SourceError(f"duration {duration:g} s, valid: {protocol.control_period:g} s or more")
     episodes = msgspec.structs.replace(
         protocol.episodes, replicates=1, per_replicate=1, horizon=duration, seed=seed
     )

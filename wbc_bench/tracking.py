@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from wbc_bench.markup import Table
 from wbc_bench.metrics import spectral_arc_length
 from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.rotations import geodesic_angle
 
 Array = NDArray[np.float64]
 STOOD = "stood"  # the outcome of a run to its end; otherwise one of episodes.TERMINATED
@@ -39,6 +40,35 @@ class Tracked:
     def time(self) -> Array:
         """(T,) [s]"""
         return self.control_period * np.arange(len(self.position_error), dtype=np.float64)
+
+
+class Series:
+    """Collects a run, a control step at a time."""
+
+    def __init__(self, control_period: float) -> None:
+        self._period = control_period  # [s]
+        self._target_pos_w: list[Array] = []
+        self._ee_pos_w: list[Array] = []
+        self._errors: list[tuple[float, float]] = []
+
+    def add(self, target_pos_w: Array, target_rot_w: Array, ee_pos_w: Array, ee_rot_w: Array) -> None:
+        """A target as it is handed over, and the hand at that moment: (3,) [m] and (3, 3) each."""
+        self._target_pos_w.append(target_pos_w)
+        self._ee_pos_w.append(ee_pos_w)
+        error = float(np.linalg.norm(ee_pos_w - target_pos_w))
+        self._errors.append((error, float(geodesic_angle(ee_rot_w, target_rot_w))))
+
+    def tracked(self, outcome: str) -> Tracked:
+        """What has been collected, of a run that ended so."""
+        errors = np.reshape(np.array(self._errors, dtype=float), (-1, 2))
+        return Tracked(
+            control_period=self._period,
+            outcome=outcome,
+            target_pos_w=np.reshape(self._target_pos_w, (-1, 3)),
+            ee_pos_w=np.reshape(self._ee_pos_w, (-1, 3)),
+            position_error=errors[:, 0],
+            orientation_error=errors[:, 1],
+        )
 
 
 class Scores(NamedTuple):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from wbc_bench.errors import SourceError, UnknownNameError
 from wbc_bench.protocol import PROTOCOL_DIR, EvalProtocol, find_protocol
 from wbc_bench.sources.interface import Source
+from wbc_bench.sources.live import LIVE, LiveSource
 from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
@@ -23,8 +24,8 @@ def script_names() -> list[str]:
 
 
 def source_names() -> list[str]:
-    """Everything that `load_source` knows by name."""
-    return [*script_names(), "stream", "diffusion"]
+    """Everything that `load_source` knows by name, as far as it is not a stream of a script."""
+    return [*script_names(), LIVE, "stream", "diffusion"]
 
 
 def find_script(name: str) -> Script:
@@ -46,14 +47,14 @@ def check_source(name: str) -> None:
     """
     if _is_diffusion(name):
         find_policy(name.partition(":")[2])
-    elif name != "stream":
+    elif name not in (LIVE, "stream"):
         find_script(name.removeprefix("stream:"))
 
 
 def load_source(
     name: str, address: str = ADDRESS, allow_remote: bool = False, protocol: EvalProtocol | None = None
 ) -> Source:
-    """The source of a name: `stream`, a script of the library or of a .toml file, `stream:SCRIPT`, or
+    """The source of a name: `live`, `stream`, a script of the library or of a .toml file, `stream:SCRIPT`, or
     `diffusion[:FILE]`, which stands in front of the first door of the protocol's seed.
 
     Raises: UnknownNameError (with the nearest names), SourceError.
@@ -66,6 +67,8 @@ def load_source(
         protocol = protocol or find_protocol("ablation_v1")[0]
         seed = protocol.episodes.seed
         return DiffusionSource(policy, draw_door(protocol, seed, 0), seed, digest=digest)
+    if name == LIVE:
+        return LiveSource()
     if name == "stream":
         return StreamSource(address, allow_remote=allow_remote)
     if name.startswith("stream:"):

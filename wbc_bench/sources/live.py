@@ -10,6 +10,8 @@ from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
 from wbc_bench.sources.interface import FRAMES, Seen, StampedTarget, from_world, to_world, unit
 from wbc_bench.sources.slew import Limits, Pose, slew
 
+LIVE = "live"
+
 
 class LiveSource:
     """The latest target wins; the robot is led there no faster than the limits. Safe between threads."""
@@ -17,7 +19,7 @@ class LiveSource:
     live = True
 
     def __init__(self, limits: Limits = Limits()) -> None:  # noqa: B008  (immutable)
-        self.name = "live"
+        self.name = LIVE
         self.counters: Mapping[str, int] = {}
         self._limits = limits
         self._lock = threading.Lock()

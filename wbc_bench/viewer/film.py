@@ -106,7 +106,7 @@ class Camera:
     def picture(self, k: int, title: str = "") -> Pixels:
         """The k-th moment, and the way to it, in pixels (height, width, 3)."""
         moment, scene, skeleton = self._again.moments[k], self._scene, self._skeleton
-        skeleton.place(moment.qpos)
+        skeleton.place(moment)
         mujoco.mj_comPos(skeleton.model, skeleton.data)
         mujoco.mj_camlight(skeleton.model, skeleton.data)
         every = mujoco.mjtCatBit.mjCAT_ALL.value

@@ -3,7 +3,6 @@
 One thread steps and draws; what a person does in the page arrives on other threads and waits in a queue.
 """
 
-import threading
 import time as clocks
 from collections import deque
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from wbc_bench.errors import BenchError
+from wbc_bench.robot import Scene as Surroundings
 from wbc_bench.viewer.moment import Moment
 from wbc_bench.viewer.panel import Panel
 from wbc_bench.viewer.scene import Scene, serving
@@ -30,7 +30,7 @@ class LiveView:
     def __init__(self, server: Any, session: Session) -> None:
         self.session = session
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self.paused, self.speed = False, 1.0
+        self.paused, self.waiting, self.speed = False, False, 1.0
         self.scene = Scene(server, session.robot, session.protocol.success, TRAIL_PIECES)
         self.gizmo = server.scene.add_transform_controls(
             "/goal", scale=GIZMO, line_width=4.0, depth_test=False
@@ -39,6 +39,7 @@ class LiveView:
         self.gizmo.on_update(lambda _: self._goal_moved())
         self._pace: deque[tuple[float, float]] = deque(maxlen=100)  # (wall, simulated) [s]
         self._drawn: Moment | None = None
+        self._surroundings: Surroundings | None = None
         self._begin()
 
     # what the page asks for, from its threads
@@ -57,6 +58,10 @@ class LiveView:
         self.session.restart(spec, source)
         self._begin()
 
+    def wait(self) -> None:
+        """Let time begin with the first goal."""
+        self.paused = self.waiting = True
+
     def step_once(self) -> None:
         """Pause, and take one step."""
         self.paused = True
@@ -64,10 +69,10 @@ class LiveView:
 
     # the loop
 
-    def run(self, stop: threading.Event) -> None:
-        """Step, draw and obey until told to stop."""
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Step, draw and obey until it is time to stop."""
         due = drawn = told = clocks.monotonic()
-        while not stop.is_set():
+        while not stop():
             self._obey()
             now = clocks.monotonic()
             if self.paused or not self.session.running:
@@ -85,6 +90,13 @@ class LiveView:
             clocks.sleep(max(0.0, due - clocks.monotonic()))
 
     @property
+    def doing(self) -> str:
+        """In a word, what the page shows."""
+        if not self.session.running:
+            return self.session.status
+        return "waiting for the first drag" if self.waiting else "paused" if self.paused else "standing"
+
+    @property
     def real_time_factor(self) -> float:
         """Simulated by elapsed time over the last steps; NaN when nothing moves."""
         if len(self._pace) < 2:
@@ -93,6 +105,7 @@ class LiveView:
         return (simulated_now - simulated) / max(wall_now - wall, 1e-9)
 
     def _step(self) -> None:
+        self.waiting = False
         self.session.step()
         self._pace.append((clocks.monotonic(), self.session.moment.time))
         self.panel.record(self.session.moment)
@@ -117,6 +130,9 @@ class LiveView:
     def _begin(self) -> None:
         self._pace.clear()
         self.scene.clear()
+        if self._surroundings is not self.session.surroundings:
+            self._surroundings = self.session.surroundings
+            self.scene.furnish(self._surroundings)
         self.gizmo.position, self.gizmo.wxyz = hand_pose(self.session.moment)
         self.gizmo.visible = self.session.dragged
         self.panel.begin()
@@ -125,27 +141,32 @@ class LiveView:
     def _goal_moved(self) -> None:
         pos_w, wxyz = np.array(self.gizmo.position), np.array(self.gizmo.wxyz)
         self.session.set_goal(pos_w, wxyz / np.linalg.norm(wxyz))
+        if self.waiting:
+            self.paused = self.waiting = False
         self.panel.show_goal(pos_w, wxyz)
 
 
 def serve(
     host: str,
     port: int,
-    asked: tuple[str, str, str, str, int],
+    session: Session,
     ready: Callable[[str], None],
-    stop: threading.Event | None = None,
+    once: bool = False,
 ) -> None:
-    """Run a session (`asked`: see `Session`) in a page until told to stop; `ready` is given its address.
+    """Show a session in a page, whose address `ready` is given, and close it in the end.
 
-    Raises: BenchError, what of it cannot be loaded, or that the port is taken.
+    `once`: its time begins with the first goal, and it is shown no longer than it lasts.
+
+    Raises: BenchError without viser, or when the port is taken.
     """
-    session = Session(*asked)
     try:
         with serving(host, port) as server:
             if server.get_port() != port:
                 raise BenchError(f"port {port} is in use, valid: another --port, e.g. {server.get_port()}")
             view = LiveView(server, session)
+            if once:
+                view.wait()
             ready(f"http://{'localhost' if host == '0.0.0.0' else host}:{port}")
-            view.run(stop or threading.Event())
+            view.run(lambda: once and not session.running)
     finally:
         session.close()

@@ -20,6 +20,7 @@ class Moment(NamedTuple):
 
     time: float  # [s] since the start of the episode
     qpos: Array  # (21,) base position [m], base quaternion wxyz, joints [rad]
+    scenery: Array  # (K,) positions of the joints that a scene added, e.g. of a door [rad]
     target_pos_w: Array  # (3,) [m]
     target_rot_w: Array  # (3, 3)
     ee_pos_w: Array  # (3,) [m]
@@ -46,6 +47,7 @@ def moment_of(loop: ControlLoop, row: int, pos_w: Array, rot_w: Array, push_w: A
     return Moment(
         time=loop.step * loop.period,
         qpos=loop.simulation.qpos[row],
+        scenery=loop.simulation.scenery[row],
         target_pos_w=pos_w,
         target_rot_w=rot_w,
         ee_pos_w=state.ee_pos_w[row],
@@ -79,9 +81,9 @@ class Skeleton:
         self.model, self.data = model, mujoco.MjData(model)
         self._corners = [[model.geom(f"foot_{side}_{k}").id for k in range(4)] for side in "LR"]
 
-    def place(self, qpos: Array) -> None:
-        """Put every body where it is in a configuration (21,)."""
-        self.data.qpos[:] = qpos
+    def place(self, moment: Moment) -> None:
+        """Put every body where it is at a moment."""
+        self.data.qpos[:] = [*moment.qpos, *moment.scenery]
         mujoco.mj_kinematics(self.model, self.data)
 
     def support(self, foot_force_w: Array) -> Array:

@@ -7,9 +7,9 @@ import numpy as np
 
 from wbc_bench.controller import controllers
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, rpy_from_matrix, wxyz_from_matrix
+from wbc_bench.sources import source_names
 from wbc_bench.tables import CM, DEG
 from wbc_bench.viewer.moment import Array, Moment
-from wbc_bench.viewer.session import live_source_names
 
 if TYPE_CHECKING:
     from wbc_bench.viewer.live import LiveView
@@ -45,7 +45,7 @@ class Panel:
         with gui.add_folder("Who and what"):
             specs = sorted({*controllers(), session.spec})
             self._spec = gui.add_dropdown("Controller", specs, initial_value=session.spec)
-            sources = [*dict.fromkeys([*live_source_names(), session.source_name])]
+            sources = [*dict.fromkeys([*source_names(), session.source_name])]
             self._source = gui.add_dropdown("Source", sources, initial_value=session.source_name)
         self._history: deque[tuple[float, float, float]] = deque(
             maxlen=round(CHART_SECONDS / session.period / CHART_EVERY)
@@ -83,10 +83,9 @@ class Panel:
     def update(self, real_time_factor: float) -> None:
         """Show the present state."""
         session, moment = self._view.session, self._view.session.moment
-        doing = session.status if not session.running else "paused" if self._view.paused else "standing"
         pace = "–" if np.isnan(real_time_factor) else f"{real_time_factor:.2f} × real time"
         self._state.content = (
-            f"**{doing}** · {moment.time:.1f} s · {pace}\n\n"
+            f"**{self._view.doing}** · {moment.time:.1f} s · {pace}\n\n"
             f"position **{moment.position_error * CM:.1f} cm** · "
             f"orientation **{moment.orientation_error * DEG:.1f}°**\n\n"
             f"sees: {', '.join(sorted(session.controller.info.signals)) or 'nothing'}"

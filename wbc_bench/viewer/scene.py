@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wbc_bench.errors import BenchError
 from wbc_bench.protocol import Success
 from wbc_bench.robot import Robot
+from wbc_bench.robot import Scene as Surroundings
 from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 
@@ -59,7 +60,7 @@ class Scene:
     def __init__(self, server: Any, robot: Robot, success: Success, trail_chunks: int | None = None) -> None:
         """`trail_chunks` is the length of the trails in pieces of CHUNK points; None keeps all of it."""
         scene, self._success = server.scene, success
-        self.skeleton = Skeleton(robot.model())
+        self._robot = robot
         scene.set_up_direction("+z")
         # software renderers draw shadows and reflections slowly, and in stripes
         scene.configure_default_lights(enabled=True, cast_shadow=False)
@@ -73,7 +74,8 @@ class Scene:
             **{"cell_size": 0.5, "cell_color": CELL, "section_size": 0.5, "section_color": CELL},
             **{"plane_color": GROUND, "plane_opacity": 1.0, "shadow_opacity": 0.0},
         )
-        self._bodies = _add_robot(scene, self.skeleton.model)
+        self._draw, self._bodies, self._parts = scene, {}, []
+        self.furnish(None)
         self._target = scene.add_frame("/target", axes_length=0.16, axes_radius=0.006, origin_radius=0.0)
         radius = success.position
         self._tolerance = scene.add_icosphere("/target/tolerance", radius, OUTSIDE, opacity=0.3)
@@ -91,6 +93,13 @@ class Scene:
             _Trail(scene, "/trail_target", TARGET, trail_chunks),
         )
 
+    def furnish(self, surroundings: Surroundings | None) -> None:
+        """Draw the robot in its surroundings from now on, or on bare ground."""
+        for part in self._parts:
+            part.remove()
+        self.skeleton = Skeleton(self._robot.model(scene=surroundings))
+        self._bodies, self._parts = _add_bodies(self._draw, self.skeleton.model)
+
     def clear(self) -> None:
         """Forget what was before."""
         for trail in self._trails:
@@ -98,7 +107,7 @@ class Scene:
 
     def show(self, moment: Moment) -> None:
         """Draw a moment, which is later than the one before or follows a `clear`."""
-        self.skeleton.place(moment.qpos)
+        self.skeleton.place(moment)
         data = self.skeleton.data
         for number, handle in self._bodies.items():
             handle.position, handle.wxyz = data.xpos[number], data.xquat[number]
@@ -157,51 +166,49 @@ class _Trail:
         self._handles, self._points = [], []
 
 
-def _add_robot(scene: Any, model: mujoco.MjModel) -> dict[int, Any]:
-    """Body number -> the frame that its shapes move with."""
-    bodies = {}
+def _add_bodies(scene: Any, model: mujoco.MjModel) -> tuple[dict[int, Any], list[Any]]:
+    """Body number -> the frame that its shapes move with; and everything that was added."""
+    bodies, parts = {}, []
     for body in range(1, model.nbody):
-        name = f"/robot/{model.body(body).name}"
+        name = f"/body/{model.body(body).name}"
         bodies[body] = scene.add_frame(name, show_axes=False)
         for geom in np.flatnonzero(model.geom_bodyid == body):
-            _add_geom(scene, f"{name}/{model.geom(geom).name}", model, geom)
+            parts.append(_add_geom(scene, f"{name}/{model.geom(geom).name}", model, geom))
     for child in range(2, model.nbody):
         parent, offset = model.body_parentid[child], model.body_pos[child]
         length = float(np.linalg.norm(offset))
-        if length < BONE_RADIUS:
+        if parent == 0 or length < BONE_RADIUS:
             continue
         quat = np.zeros(4)
         mujoco.mju_quatZ2Vec(quat, offset)
-        name = f"/robot/{model.body(parent).name}/to_{model.body(child).name}"
-        _add_round(scene, name, length, BONE_RADIUS, True, BONE, position=offset / 2, wxyz=quat)
-    return bodies
+        name = f"/body/{model.body(parent).name}/to_{model.body(child).name}"
+        parts.append(_add_round(scene, name, length, BONE_RADIUS, True, BONE, position=offset / 2, wxyz=quat))
+    return bodies, [*parts, *bodies.values()]
 
 
-def _add_geom(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> None:
+def _add_geom(scene: Any, name: str, model: mujoco.MjModel, geom: int) -> Any:
     kind, size = model.geom_type[geom], model.geom_size[geom]
     colour = tuple(int(255 * c) for c in model.geom_rgba[geom, :3])
     pose = {"position": model.geom_pos[geom], "wxyz": model.geom_quat[geom]}
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         # boxes that share a face would flicker there
-        scene.add_box(name, colour, tuple(2 * size + FACE * (geom % 4)), **pose)
-    elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        scene.add_icosphere(name, float(size[0]), colour, subdivisions=1, **pose)
-    else:
-        round_ends = kind == mujoco.mjtGeom.mjGEOM_CAPSULE
-        _add_round(scene, name, 2 * float(size[1]), float(size[0]), round_ends, colour, **pose)
+        return scene.add_box(name, colour, tuple(2 * size + FACE * (geom % 4)), **pose)
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return scene.add_icosphere(name, float(size[0]), colour, subdivisions=1, **pose)
+    round_ends = kind == mujoco.mjtGeom.mjGEOM_CAPSULE
+    return _add_round(scene, name, 2 * float(size[1]), float(size[0]), round_ends, colour, **pose)
 
 
 def _add_round(
     scene: Any, name: str, length: float, radius: float, round_ends: bool, colour: Any, **pose: Any
-) -> None:
+) -> Any:
     """A capsule or cylinder along z."""
     from trimesh import creation
 
     if round_ends:
         mesh = creation.capsule(height=length, radius=radius, count=[20, 10])
-        scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=colour, **pose)
-    else:
-        scene.add_cylinder(name, radius, length, colour, **pose)
+        return scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=colour, **pose)
+    return scene.add_cylinder(name, radius, length, colour, **pose)
 
 
 def _add_arrow(scene: Any, name: str, colour: Colour, radius: float) -> Any:
