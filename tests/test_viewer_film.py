@@ -37,6 +37,13 @@ def test_a_strip_shows_the_moments_asked_for(again: Rerun, strip: film.Pixels) -
     assert ((red > 180) & (red - green > 40) & (green - blue > 20)).sum() > 30
 
 
+def test_the_caption_of_a_strip_names_episode_end_and_times(again: Rerun) -> None:
+    end = f"{again.moments[-1].time:g}"
+    caption = film.strip_caption(again, times=[0.0, 99.0])
+    assert caption.startswith(f"{again.title}: {again.stored['outcome']}. At 0, {end} s;")
+    assert film.strip_caption(again).count(",") >= film.PANELS
+
+
 def test_everything_that_matters_is_in_the_picture(again: Rerun, strip: film.Pixels) -> None:
     half = np.array([0.5, 0.4])
     view = film._view(again.moments, half)

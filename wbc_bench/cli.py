@@ -347,7 +347,7 @@ class Film(_Again):
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Film to write (.mp4)."""
     strip: Path | None = None
-    """Strip of pictures to write (.png)."""
+    """Strip of pictures to write (.png), and its caption beside it (.txt)."""
     times: tuple[float, ...] | None = None
     """Seconds of the pictures of a strip; six, evenly over the episode, when not given."""
 
@@ -363,8 +363,8 @@ class Film(_Again):
             ) from error
 
         from wbc_bench.progress import Progress
-        from wbc_bench.store import ResultStore
-        from wbc_bench.viewer.film import strip_of, write_film_of
+        from wbc_bench.store import ResultStore, write_atomic
+        from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
         from wbc_bench.viewer.rerun import rerun
 
         if self.out is None and self.strip is None:
@@ -385,6 +385,7 @@ class Film(_Again):
         if self.strip:
             pixels = strip_of(again, self.times)
             image.imsave(self.strip, pixels, format="png", pil_kwargs={"pnginfo": None})
+            write_atomic(self.strip.with_suffix(".txt"), strip_caption(again, self.times).encode())
             print(self.strip)
 
 

@@ -69,12 +69,27 @@ def strip_of(again: Rerun, times: Sequence[float] | None = None) -> Pixels:
 
     A time beyond the end shows the end. Raises: BenchError without OpenGL.
     """
-    clock = np.array([moment.time for moment in again.moments])
-    at = np.linspace(0.0, clock[-1], PANELS).tolist() if times is None else times
     with Camera(again, PANEL, samples=4) as camera:
-        pictures = [camera.picture(int(np.abs(clock - time).argmin())) for time in at]
+        pictures = [camera.picture(k) for k in _shown(again, times)]
     gap = np.full((PANEL[1], GAP, 3), 255, dtype=np.uint8)
     return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1)
+
+
+def strip_caption(again: Rerun, times: Sequence[float] | None = None) -> str:
+    """What is to be seen in a strip, as the report prints it below."""
+    at = ", ".join(f"{again.moments[k].time:g}" for k in _shown(again, times))
+    outcome = str(again.stored["outcome"]).replace("_", " ")
+    return (
+        f"{again.title}: {outcome}. At {at} s; blue line: the way of the hand, sphere: the tolerance about "
+        "the target, green when the hand is inside it in position and orientation.\n"
+    )
+
+
+def _shown(again: Rerun, times: Sequence[float] | None) -> list[int]:
+    """The moments next to `times` [s]; by default PANELS of them, evenly over the episode."""
+    clock = np.array([moment.time for moment in again.moments])
+    at = np.linspace(0.0, clock[-1], PANELS).tolist() if times is None else times
+    return [int(np.abs(clock - time).argmin()) for time in at]
 
 
 class Camera:
