@@ -23,12 +23,14 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.fixture
-def browser() -> Iterator:
+def browsers() -> Iterator[list]:
+    """Two, each a process of its own."""
     api = pytest.importorskip("playwright.sync_api")
     with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE))
-        yield browser
-        browser.close()
+        both = [playwright.chromium.launch(executable_path=CHROMIUM, args=list(SOFTWARE)) for _ in range(2)]
+        yield both
+        for browser in both:
+            browser.close()
 
 
 def pixel_of(camera, point_w: np.ndarray) -> np.ndarray:
@@ -49,9 +51,9 @@ def open_page(browser, url: str, problems: list[str]):
     return page
 
 
-def test_the_hand_follows_the_dragged_gizmo_and_a_second_browser_sees_it(browser, served: Served) -> None:  # noqa: F811
+def test_the_hand_follows_the_dragged_gizmo_and_a_second_browser_sees_it(browsers, served: Served) -> None:  # noqa: F811
     problems: list[str] = []
-    page = open_page(browser, served.url, problems)
+    page = open_page(browsers[0], served.url, problems)
     wait_for(lambda: len(served.server.get_clients()) == 1, 60, "the page is connected")
     view, session = served.view, served.session
     camera = next(iter(served.server.get_clients().values())).camera
@@ -74,8 +76,8 @@ def test_the_hand_follows_the_dragged_gizmo_and_a_second_browser_sees_it(browser
     assert abs((goal - start) @ up_w) == pytest.approx(np.linalg.norm(goal - start), rel=0.01)
     wait_for(lambda: bool(np.linalg.norm(session.moment.ee_pos_w - goal) < 0.02), 60, "the hand is there")
 
-    second = open_page(browser, served.url, problems)
-    wait_for(lambda: len(served.server.get_clients()) == 2, 60, "the second page is connected")
+    second = open_page(browsers[1], served.url, problems)
+    wait_for(lambda: len(served.server.get_clients()) == 2, 60, "the second browser is connected")
     for one in (page, second):
         shown = one.locator("input").evaluate_all("all => all.map(input => input.value)")
         assert any(abs(float(value) - goal[2]) < 2e-3 for value in shown if _is_number(value)), shown
