@@ -90,14 +90,14 @@ def test_every_method_begins_with_the_same_policy(method, tmp_path):
 
 def test_first_only_the_critic_learns(tmp_path):
     t = trainer(critic_iterations=1)
-    before = [p.clone() for p in t.ppo.actor.parameters()]
+    before = [p.clone() for p in t.ppo.actor.mlp.parameters()]
     critic = [p.clone() for p in t.ppo.critic.parameters()]
     found = t.iterate()
-    assert all(map(torch.equal, before, t.ppo.actor.parameters()))
+    assert all(map(torch.equal, before, t.ppo.actor.mlp.parameters()))
     assert not any(map(torch.equal, critic, t.ppo.critic.parameters()))
     assert found["policy/learning_rate"] == t.settings.learning_rate
     t.iterate()
-    assert not all(map(torch.equal, before, t.ppo.actor.parameters()))
+    assert not all(map(torch.equal, before, t.ppo.actor.mlp.parameters()))
 
 
 def test_a_start_has_no_context(tmp_path):

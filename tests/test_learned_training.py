@@ -187,14 +187,36 @@ def test_time_outs_are_bootstrapped():
     torch.testing.assert_close(stored[1:], step.reward[1:])
 
 
-def test_entropy_and_curriculum_follow_the_budget():
-    t = trainer(curriculum=0.5)
-    bonus, ramp = [], []
+def test_noise_and_curriculum_follow_the_budget():
+    t = trainer(curriculum=0.5, std_legs=(0.4, 0.1), std_arm=(1.0, 0.01), std_share=0.5)
+    noise, ramp = [], []
     while not t.done:
-        bonus.append(t.iterate()["policy/entropy_bonus"])
+        found = t.iterate()
+        noise.append((found["policy/std_legs"], found["policy/std_arm"]))
         ramp.append(t.environment.curriculum)
-    np.testing.assert_allclose(bonus, 0.01 + np.arange(4) / 4 * (0.0005 - 0.01))
+        std = t.ppo.actor.distribution.log_std_param.exp()
+        torch.testing.assert_close(std, torch.tensor([noise[-1][0]] * 8 + [noise[-1][1]] * 6))
+    np.testing.assert_allclose(noise, [(0.4, 1.0), (0.2, 0.1), (0.1, 0.01), (0.1, 0.01)])
     np.testing.assert_allclose(ramp, [0, 0.5, 1, 1])
+
+
+def test_policy_and_critic_have_rates_of_their_own():
+    t = trainer(critic_learning_rate=7e-3, least_learning_rate=3e-3)
+    t.iterate()
+    rates = [group["lr"] for group in t.ppo.optimizer.param_groups]
+    assert rates[0] == t.ppo.learning_rate >= 3e-3 and rates[1] == 7e-3
+    mine = {id(p) for p in t.ppo.actor.parameters()}
+    assert {id(p) for p in t.ppo.optimizer.param_groups[0]["params"]} == mine
+    still = t.ppo.actor.distribution.log_std_param
+    assert still not in t.ppo.optimizer.state  # it follows the schedule alone
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("std_share", 0.0), ("std_legs", (0.1, 0.0)), ("std_arm", (-1.0, 0.1))]
+)
+def test_noise_that_cannot_be_is_refused(name, value):
+    with pytest.raises(TrainingError, match=f"--{name.replace('_', '-')} .*valid: more than 0"):
+        replace(TINY, **{name: value}).check()
 
 
 @pytest.mark.parametrize("method", ["no_latent", "cenet", "transformer_gru", "oracle"])
@@ -246,7 +268,7 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
 def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     """Every reward term is logged; a longer budget goes on; other settings are refused by name."""
     folder = RunFolder(tmp_path / TINY.name)
-    constant = replace(TINY, entropy=(0.01, 0.01))  # the schedule knows the budget
+    constant = replace(TINY, std_legs=(0.4, 0.4), std_arm=(1.0, 1.0))  # a schedule knows the budget
     run(replace(constant, budget=2 * 48), folder, tensorboard=False)
     assert is_done(folder, replace(constant, budget=96)) and not is_done(folder, constant)
     with folder.metrics.open("a") as file:
@@ -260,7 +282,7 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     assert {f"reward/{name}" for name in SCALES} <= rows[0].keys()
     assert any((folder.path / "tensorboard").iterdir())
     assert not folder.claim.exists()
-    unbroken = trainer(entropy=constant.entropy)
+    unbroken = trainer(std_legs=constant.std_legs, std_arm=constant.std_arm)
     while not unbroken.done:
         unbroken.iterate()
     resumed = trainer()

@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from wbc_baselines.learned.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
 
@@ -33,13 +35,13 @@ class Settings:
     minibatches: int = 8
     """Parts of a rollout in one pass."""
     learning_rate: float = 3e-4
-    """At the start; then adapted to `desired_kl`."""
+    """Of the policy at the start; then adapted to `desired_kl`."""
     least_learning_rate: float = 1e-4
     """Below which it is not adapted."""
+    critic_learning_rate: float = 5e-4
+    """Of the critic, throughout."""
     desired_kl: float = 0.01
     """KL divergence of an update that the learning rate aims at."""
-    entropy: tuple[float, float] = (0.01, 0.0005)
-    """Entropy bonus at the start and at the end of the budget, linear in between."""
     gamma: float = 0.99
     """Discount of a control step."""
     lam: float = 0.95
@@ -54,10 +56,12 @@ class Settings:
     """Observations that the start's normaliser counts for."""
     critic_iterations: int = 0
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: float = 0.4
-    """Standard deviation of the leg actions at the start."""
-    std_arm: float = 1.0
-    """Standard deviation of the arm actions at the start."""
+    std_legs: tuple[float, float] = (0.4, 0.1)
+    """Standard deviation of the leg actions at the start and in the end."""
+    std_arm: tuple[float, float] = (1.0, 0.1)
+    """Standard deviation of the arm actions at the start and in the end."""
+    std_share: float = 0.25
+    """Part of the budget over which they fall, exponentially."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
     decimation: int = 2
@@ -85,6 +89,12 @@ class Settings:
         """Whole rollouts that reach the budget."""
         return math.ceil(self.budget / (self.envs * self.steps))
 
+    def std(self, part: float) -> tuple[float, float]:
+        """Standard deviations of leg and arm actions when a part in [0, 1] of the budget is used up."""
+        way = min(1.0, part / self.std_share)
+        legs, arm = (first * (last / first) ** way for first, last in (self.std_legs, self.std_arm))
+        return legs, arm
+
     def check(self) -> None:
         """Refuse what cannot be run.
 
@@ -98,6 +108,10 @@ class Settings:
             if getattr(self, name) < 1:
                 option = name.replace("_", "-")
                 raise TrainingError(f"--{option} {getattr(self, name)}: valid: 1 or more")
+        for name in ("std_share", "std_legs", "std_arm"):
+            if not np.all(np.array(getattr(self, name)) > 0):
+                option = name.replace("_", "-")
+                raise TrainingError(f"--{option} {getattr(self, name)}: valid: more than 0")
         if self.envs * self.steps < self.minibatches:
             raise TrainingError(
                 f"--minibatches {self.minibatches}: valid: 1 to {self.envs * self.steps} (envs x steps)"

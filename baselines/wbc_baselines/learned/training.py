@@ -5,6 +5,7 @@ a gradient, so no update of the policy can reach the estimator. All randomness o
 seed and the iteration's number, so between two iterations no generator has a state worth keeping.
 """
 
+import math
 import time
 import zlib
 from collections.abc import Iterator
@@ -139,11 +140,10 @@ class Trainer:
         common = {"hidden_dims": HIDDEN, "activation": "elu", "obs_normalization": True}
         actor = MLPModel(seen, groups, "actor", ACTIONS, distribution_cfg=gaussian, **common)
         critic = MLPModel(seen, groups, "critic", 1, **common)
-        std = torch.full((ACTIONS,), settings.std_arm)
-        std[:NUM_LEG_JOINTS] = settings.std_legs
-        with torch.no_grad():
-            actor.distribution.log_std_param.copy_(std.log())  # type: ignore[union-attr]
-            if settings.start:
+        self._log_std = actor.distribution.log_std_param  # type: ignore[union-attr]
+        self._log_std.requires_grad_(False)  # follows a schedule, see `iterate`
+        if settings.start:
+            with torch.no_grad():
                 begin_with(actor, checkpoint.load_start(settings.start), settings.start_samples)
         storage = RolloutStorage("rl", settings.envs, settings.steps, seen, [ACTIONS], str(self.device))
         ppo = PPO(
@@ -155,7 +155,7 @@ class Trainer:
             clip_param=settings.clip,
             gamma=settings.gamma,
             lam=settings.lam,
-            entropy_coef=settings.entropy[0],
+            entropy_coef=0.0,  # would act on the deviation alone
             learning_rate=settings.learning_rate,
             max_grad_norm=settings.gradient_norm,
             use_clipped_value_loss=False,
@@ -163,20 +163,21 @@ class Trainer:
             desired_kl=settings.desired_kl,
             device=str(self.device),
         )
-        least = settings.least_learning_rate
+        groups = [{"params": list(model.parameters())} for model in (actor, critic)]
+        ppo.optimizer = torch.optim.Adam(groups, settings.learning_rate)
 
-        def bound(optimizer: torch.optim.Optimizer, *_: object) -> None:
-            rate = max(ppo.learning_rate, least)
+        def set_rates(optimizer: torch.optim.Optimizer, *_: object) -> None:
+            ppo.learning_rate = max(ppo.learning_rate, settings.least_learning_rate)
             if self.iteration < settings.critic_iterations:
-                rate = settings.learning_rate  # a policy at rest has no divergence to adapt to
+                ppo.learning_rate = settings.learning_rate  # a policy at rest has no divergence to adapt to
                 for parameter in actor.parameters():
                     parameter.grad = None
-            ppo.learning_rate = rate
-            for group in optimizer.param_groups:
+            rates = ppo.learning_rate, settings.critic_learning_rate
+            for group, rate in zip(optimizer.param_groups, rates, strict=True):
                 group["lr"] = rate
 
-        # PPO has no option for the least learning rate, nor for a critic that learns alone
-        ppo.optimizer.register_step_pre_hook(bound)
+        # PPO has one rate for both, without a lower bound, and no critic that learns alone
+        ppo.optimizer.register_step_pre_hook(set_rates)
         return ppo
 
     # ---- one iteration -------------------------------------------------------------------------------------
@@ -196,7 +197,8 @@ class Trainer:
         settings, environment, ppo = self.settings, self.environment, self.ppo
         part = self.iteration / settings.iterations
         torch.manual_seed(_key(settings.seed, "iteration", self.iteration))
-        ppo.entropy_coef = settings.entropy[0] + part * (settings.entropy[1] - settings.entropy[0])
+        legs, arm = settings.std(part)
+        self._log_std[:NUM_LEG_JOINTS], self._log_std[NUM_LEG_JOINTS:] = math.log(legs), math.log(arm)
         environment.curriculum = min(1.0, part / settings.curriculum) if settings.curriculum else 1.0
         environment.clear_log()
         environment.begin_rollout(self.iteration, settings.steps)
@@ -219,12 +221,10 @@ class Trainer:
             )
         seconds = [b - a for a, b in pairwise(clock)]
         found |= dict(zip(("time/rollout", "time/policy", "time/estimator"), seconds, strict=True))
-        std = ppo.actor.distribution.log_std_param.detach().exp()  # type: ignore[union-attr]
         found |= {
-            "policy/std_legs": float(std[:NUM_LEG_JOINTS].mean()),
-            "policy/std_arm": float(std[NUM_LEG_JOINTS:].mean()),
+            "policy/std_legs": legs,
+            "policy/std_arm": arm,
             "policy/learning_rate": ppo.learning_rate,
-            "policy/entropy_bonus": ppo.entropy_coef,
         }
         return found | environment.log()
 
