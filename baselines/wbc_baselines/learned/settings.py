@@ -4,8 +4,6 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from wbc_baselines.learned.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
 
@@ -108,10 +106,13 @@ class Settings:
             if getattr(self, name) < 1:
                 option = name.replace("_", "-")
                 raise TrainingError(f"--{option} {getattr(self, name)}: valid: 1 or more")
-        for name in ("std_share", "std_legs", "std_arm"):
-            if not np.all(np.array(getattr(self, name)) > 0):
-                option = name.replace("_", "-")
-                raise TrainingError(f"--{option} {getattr(self, name)}: valid: more than 0")
+        for option, values in (
+            ("std-share", (self.std_share,)),
+            ("std-legs", self.std_legs),
+            ("std-arm", self.std_arm),
+        ):
+            if not min(values) > 0:
+                raise TrainingError(f"--{option} {' '.join(map(str, values))}: valid: more than 0")
         if self.envs * self.steps < self.minibatches:
             raise TrainingError(
                 f"--minibatches {self.minibatches}: valid: 1 to {self.envs * self.steps} (envs x steps)"
