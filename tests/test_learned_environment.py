@@ -17,7 +17,14 @@ from wbc_baselines.learned.backends.base import Start  # noqa: E402
 from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.environment import Environment, noise_half_widths, rotation_from_wxyz  # noqa: E402
 from wbc_baselines.learned.pool import POOLS, TargetPool, digest, draw_pool, read_pool, write_pool  # noqa: E402
-from wbc_baselines.learned.starts import DECAY, FIRST_SHARES, draw_pushes, draw_starts, shares  # noqa: E402
+from wbc_baselines.learned.starts import (  # noqa: E402
+    DECAY,
+    FIRST_SHARES,
+    draw_pushes,
+    draw_starts,
+    shares,
+    weakened,
+)
 from wbc_bench import randomization  # noqa: E402
 from wbc_bench.episodes import STRATA  # noqa: E402
 from wbc_bench.errors import ManifestError  # noqa: E402
@@ -363,3 +370,23 @@ def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
     with pytest.raises(ManifestError, match="wbc-train targets"):
         read_pool(PROTOCOL, tmp_path / "none.parquet")
     assert POOLS.exists() and len(STRATA) == 3
+
+
+def test_weakened_disturbances_lie_between_none_and_the_protocols():
+    """At 0 the nominal robot of the evaluation, at 1 the protocol itself, halfway in between."""
+    assert weakened(PROTOCOL, 1.0) is PROTOCOL
+    none = randomization.undisturbed(PROTOCOL, 0, 0)
+    draws = draw_starts(weakened(PROTOCOL, 0.0), POOL, 5, stream(3, "test"))
+    for name, value in draws.start._asdict().items():
+        np.testing.assert_allclose(value, np.broadcast_to(getattr(none, name), value.shape), err_msg=name)
+    assert (draws.push_step == -1).all() and not draws.push_vel.any()
+    assert not noise_half_widths(weakened(PROTOCOL, 0.0)).any()
+
+    half, full = weakened(PROTOCOL, 0.5), PROTOCOL
+    np.testing.assert_allclose(noise_half_widths(half), noise_half_widths(full) / 2)
+    assert half.push.speed == full.push.speed / 2 and half.push.interval == full.push.interval
+    spread = half.randomization
+    np.testing.assert_allclose(spread.friction, (np.array(full.randomization.friction) + none.friction) / 2)
+    np.testing.assert_allclose(spread.gain, (np.array(full.randomization.gain) + 1) / 2)
+    np.testing.assert_allclose(spread.base_mass, np.array(full.randomization.base_mass) / 2)
+    assert spread.leg_q == full.randomization.leg_q / 2

@@ -194,10 +194,21 @@ def test_noise_and_curriculum_follow_the_budget():
         found = t.iterate()
         noise.append((found["policy/std_legs"], found["policy/std_arm"]))
         ramp.append(t.environment.curriculum)
-        std = t.ppo.actor.distribution.log_std_param.exp()
+        std = t._log_std.exp()
         torch.testing.assert_close(std, torch.tensor([noise[-1][0]] * 8 + [noise[-1][1]] * 6))
     np.testing.assert_allclose(noise, [(0.4, 1.0), (0.2, 0.1), (0.1, 0.01), (0.1, 0.01)])
     np.testing.assert_allclose(ramp, [0, 0.5, 1, 1])
+
+
+def test_disturbances_rise_with_the_budget():
+    t = trainer(calm=(0.25, 0.75))
+    assert t.environment.severity == 0.0
+    found = [t.iterate()["episode/severity"] for _ in range(4)]
+    np.testing.assert_allclose(found, [0.0, 0.0, 0.5, 1.0])
+    assert trainer().environment.severity == 1.0
+    for calm in ((0.5, 0.2), (0.3, 0.3), (-0.1, 0.5), (0.5, 1.5)):
+        with pytest.raises(TrainingError, match=r"--calm .*valid: 0 <= begin"):
+            replace(TINY, calm=calm).check()
 
 
 def test_policy_and_critic_have_rates_of_their_own():
@@ -207,8 +218,7 @@ def test_policy_and_critic_have_rates_of_their_own():
     assert rates[0] == t.ppo.learning_rate >= 3e-3 and rates[1] == 7e-3
     mine = {id(p) for p in t.ppo.actor.parameters()}
     assert {id(p) for p in t.ppo.optimizer.param_groups[0]["params"]} == mine
-    still = t.ppo.actor.distribution.log_std_param
-    assert still not in t.ppo.optimizer.state  # it follows the schedule alone
+    assert t._log_std not in t.ppo.optimizer.state  # it follows the schedule alone
 
 
 @pytest.mark.parametrize(

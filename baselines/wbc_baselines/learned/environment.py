@@ -12,7 +12,7 @@ from wbc_baselines.learned.methods import Reward
 from wbc_baselines.learned.pool import TargetPool
 from wbc_baselines.learned.reference import advance, initial_reference, pose_errors
 from wbc_baselines.learned.rewards import Body, Signals, rewards
-from wbc_baselines.learned.starts import Draws, draw_starts
+from wbc_baselines.learned.starts import Draws, draw_starts, weakened
 from wbc_bench.episodes import STRATA
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.randomness import stream
@@ -86,17 +86,24 @@ class Environment:
     """Training's environment. Draws come from streams of `seed`, by counters, so that it can be resumed."""
 
     def __init__(
-        self, protocol: EvalProtocol, backend: Backend, pool: TargetPool, reward: Reward, seed: int
+        self,
+        protocol: EvalProtocol,
+        backend: Backend,
+        pool: TargetPool,
+        reward: Reward,
+        seed: int,
+        severity: float = 1.0,
     ) -> None:
+        """`severity`: see `starts.weakened`."""
         self.protocol, self.num_envs, self.device = protocol, backend.num_envs, backend.device
         self.curriculum = 1.0  # part of the ramp over strata that is done
+        self.severity = severity  # of the episodes that begin and of the noise, from now on
         self._backend, self._seed = backend, seed
         self._reward: Reward = reward
         self._robot = load_robot(protocol.robot)
         self._pool, self._body = pool, body_of(self._robot, self.device)
         self._default_q = self._tensor(self._robot.default_q)
         self._scale = self._tensor(self._robot.action_scale)
-        self._half = self._tensor(noise_half_widths(protocol))
         self._noise = torch.zeros(1, self.num_envs, inputs.HISTORY_TERM, device=self.device)
         self._at = 0  # row of the noise
         self._resets = 0
@@ -124,7 +131,8 @@ class Environment:
     def _draw(self, count: int) -> Draws:
         rng = stream(self._seed, "training start", self._resets)
         self._resets += 1
-        return draw_starts(self.protocol, self._pool, count, rng, self.curriculum)
+        protocol = weakened(self.protocol, self.severity)
+        return draw_starts(protocol, self._pool, count, rng, self.curriculum)
 
     def _fresh_episode(self, draws: Draws, state: State) -> Episode:
         start, chosen, count = draws.start, draws.target, len(draws.target)
@@ -172,7 +180,8 @@ class Environment:
         """Draw the observation noise of the next `steps` steps at once."""
         rng = stream(self._seed, "training noise", iteration)
         unit = rng.random((steps, self.num_envs, inputs.HISTORY_TERM), dtype=np.float32)
-        self._noise = torch.from_numpy(unit).to(self.device).mul_(2).sub_(1).mul_(self._half)
+        half = self._tensor(noise_half_widths(weakened(self.protocol, self.severity)))
+        self._noise = torch.from_numpy(unit).to(self.device).mul_(2).sub_(1).mul_(half)
         self._at = 0
 
     @torch.no_grad()

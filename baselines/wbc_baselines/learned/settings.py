@@ -66,6 +66,9 @@ class Settings:
     """Physics steps in a control period."""
     curriculum: float = 0.0
     """Part of the budget over which the strata ramp from mostly `arm` to the protocol's weights."""
+    calm: tuple[float, float] = (0.0, 0.0)
+    """Parts of the budget from which on and until when noise, pushes and randomisation rise from none to the
+    protocol's; before, there are none."""
     estimator_share: float = 0.125
     """Part of the environments whose rollouts train the estimator; drawn anew each iteration."""
     estimator_minibatches: int = 4
@@ -93,6 +96,11 @@ class Settings:
         legs, arm = (first * (last / first) ** way for first, last in (self.std_legs, self.std_arm))
         return legs, arm
 
+    def severity(self, part: float) -> float:
+        """Of the disturbances, in [0, 1], when a part in [0, 1] of the budget is used up."""
+        begin, end = self.calm
+        return min(1.0, max(0.0, (part - begin) / (end - begin))) if part < end else 1.0
+
     def check(self) -> None:
         """Refuse what cannot be run.
 
@@ -113,6 +121,9 @@ class Settings:
         ):
             if not min(values) > 0:
                 raise TrainingError(f"--{option} {' '.join(map(str, values))}: valid: more than 0")
+        begin, end = self.calm
+        if not (0.0 <= begin <= end <= 1.0 and (begin < end or end == 0.0)):
+            raise TrainingError(f"--calm {begin} {end}: valid: 0 <= begin < end <= 1, or 0 0 for never")
         if self.envs * self.steps < self.minibatches:
             raise TrainingError(
                 f"--minibatches {self.minibatches}: valid: 1 to {self.envs * self.steps} (envs x steps)"

@@ -1,7 +1,8 @@
 """What an episode of training draws: the evaluation's quantities and ranges, many episodes at once."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +11,7 @@ from wbc_baselines.learned.pool import TargetPool
 from wbc_bench.episodes import STRATA
 from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
 from wbc_bench.randomization import resting_height
-from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS
+from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
 Array = NDArray[np.float64]
 DECAY = (0.5, 1.4)  # [1/s] v_ref in training. Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
@@ -34,6 +35,28 @@ def shares(protocol: EvalProtocol, curriculum: float) -> Array:
     weights = protocol.targets.weights
     last = np.array([float(weights.get(name, 0)) for name in STRATA])
     return FIRST_SHARES * (1 - curriculum) + last / last.sum() * curriculum
+
+
+def weakened(protocol: EvalProtocol, severity: float) -> EvalProtocol:
+    """A protocol with a part of its noise, pushes and randomisation: none at 0, all at 1."""
+    if severity == 1.0:
+        return protocol
+
+    def part(struct: Any, **neutral: float) -> Any:
+        """Every field on its way from what leaves the robot alone, 0 unless named."""
+        found = {}
+        for name in struct.__struct_fields__:
+            value, still = np.array(getattr(struct, name)), neutral.get(name, 0.0)
+            found[name] = (still + severity * (value - still)).tolist()
+        return msgspec.convert(found, type(struct))
+
+    slide = load_robot(protocol.robot).facts.friction.slide
+    return msgspec.structs.replace(
+        protocol,
+        noise=part(protocol.noise),
+        push=msgspec.structs.replace(protocol.push, speed=severity * protocol.push.speed),
+        randomization=part(protocol.randomization, friction=slide, gain=1.0),
+    )
 
 
 def draw_starts(

@@ -65,7 +65,8 @@ def make_environment(settings: Settings, pool: TargetPool | None = None) -> Envi
         backend = CpuBackend(protocol, settings.envs, settings.threads)
     if pool is None:
         pool = read_pool(find_protocol(settings.protocol)[0])
-    return Environment(protocol, backend, pool, METHODS[settings.method].reward, settings.seed)
+    reward = METHODS[settings.method].reward
+    return Environment(protocol, backend, pool, reward, settings.seed, settings.severity(0.0))
 
 
 class Rollout:
@@ -140,7 +141,7 @@ class Trainer:
         common = {"hidden_dims": HIDDEN, "activation": "elu", "obs_normalization": True}
         actor = MLPModel(seen, groups, "actor", ACTIONS, distribution_cfg=gaussian, **common)
         critic = MLPModel(seen, groups, "critic", 1, **common)
-        self._log_std = actor.distribution.log_std_param  # type: ignore[union-attr]
+        self._log_std: Tensor = actor.distribution.log_std_param  # type: ignore[union-attr, assignment]
         self._log_std.requires_grad_(False)  # follows a schedule, see `iterate`
         if settings.start:
             with torch.no_grad():
@@ -200,6 +201,7 @@ class Trainer:
         legs, arm = settings.std(part)
         self._log_std[:NUM_LEG_JOINTS], self._log_std[NUM_LEG_JOINTS:] = math.log(legs), math.log(arm)
         environment.curriculum = min(1.0, part / settings.curriculum) if settings.curriculum else 1.0
+        environment.severity = settings.severity(part)
         environment.clear_log()
         environment.begin_rollout(self.iteration, settings.steps)
         clock = [time.perf_counter()]
@@ -225,6 +227,7 @@ class Trainer:
             "policy/std_legs": legs,
             "policy/std_arm": arm,
             "policy/learning_rate": ppo.learning_rate,
+            "episode/severity": environment.severity,
         }
         return found | environment.log()
 
