@@ -354,7 +354,7 @@ def test_unknown_variant() -> None:
         make(ROBOT, "kinematics")
 
 
-@pytest.mark.parametrize("variant", ["", "kinematic", "osqp"])
+@pytest.mark.parametrize("variant", ["", "kinematic", "osqp", "standing"])
 def test_variants_are_named(variant: str) -> None:
     assert make(ROBOT, variant).info.name == (f"ik:{variant}" if variant else "ik")
 

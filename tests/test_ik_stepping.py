@@ -1,16 +1,14 @@
 """Stepping: the capture point, where a foot is put, how it swings there, and what a step is worth."""
 
-from dataclasses import replace
-
 import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 
-from wbc_baselines.ik.controller import PERIOD, IKController
+from wbc_baselines.ik import make
+from wbc_baselines.ik.controller import PERIOD
 from wbc_baselines.ik.estimation import ComFilter
 from wbc_baselines.ik.model import GRAVITY, WholeBodyModel, configuration
-from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import TUNED
 from wbc_baselines.ik.stance import Stance, base_from_sole, measured_stance, yaw_matrix
 from wbc_baselines.ik.stepping import Swing, choose, landing, outside, pressure, solve_leg
@@ -174,8 +172,7 @@ def test_steps_save_pushed_episodes() -> None:
     pushed = (np.abs(manifest.push_vel[:, 0]) > 0.35) & (np.abs(manifest.push_vel[:, 1]) < 0.25)
     rows = manifest.take(np.flatnonzero(pushed & (manifest.stratum == "arm"))[:8])
     falls = []
-    for stepping in (False, True):
-        settings = replace(TUNED, stepping=stepping)
-        controller = IKController(ROBOT, PlacoIK(ROBOT, settings.weights, PERIOD), settings)
+    for variant in ("standing", ""):
+        controller = make(ROBOT, variant)
         falls.append(int(np.isin(evaluate(controller, protocol, rows).outcome, TERMINATED).sum()))
     assert falls[1] <= falls[0] - 2

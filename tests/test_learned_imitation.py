@@ -16,9 +16,20 @@ from wbc_baselines.learned import checkpoint  # noqa: E402
 from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.cli import main  # noqa: E402
 from wbc_baselines.learned.estimators import make_estimator  # noqa: E402
-from wbc_baselines.learned.imitation import INPUTS, Lessons, begin_with, fit, record  # noqa: E402
+from wbc_baselines.learned.imitation import (  # noqa: E402
+    INPUTS,
+    Lessons,
+    Pupil,
+    begin_with,
+    draw_rows,
+    fit,
+    record,
+)
 from wbc_baselines.learned.networks import Actor  # noqa: E402
+from wbc_bench.control_loop import ControlLoop  # noqa: E402
+from wbc_bench.controller import ControllerInfo, JointCommand  # noqa: E402
 from wbc_bench.protocol import find_protocol  # noqa: E402
+from wbc_bench.robot import load_robot  # noqa: E402
 
 ACTION = slice(34, 48)  # of the observation: the action of the step before
 
@@ -62,6 +73,33 @@ def test_the_teacher_answers_wherever_the_student_drives():
     assert np.array_equal(own.seen[:3], driven.seen[:3]) and not np.array_equal(own.seen[-1], driven.seen[-1])
 
 
+class Asks:
+    """A teacher that always asks for the same normalised action."""
+
+    def __init__(self, robot, action):
+        self.info = ControllerInfo("asks", frozenset(), 0.02, "test")
+        self._q = robot.default_q + robot.action_scale * action
+
+    def reset(self, episodes, obs, target):
+        pass
+
+    def act(self, obs, target):
+        return JointCommand(np.tile(self._q, (len(obs.active), 1)))
+
+
+@pytest.mark.parametrize(("joint", "kept"), [(13, True), (0, False)], ids=["arm", "leg"])
+def test_far_reaches_of_the_arm_are_lessons_and_those_of_the_legs_are_not(joint, kept):
+    protocol, action = short_protocol(), np.zeros(14)
+    action[joint] = 6.0
+    robot, rows = load_robot(protocol.robot), draw_rows(protocol, POOL, 2, np.random.default_rng(0))
+    pupil = Pupil(robot, protocol, Asks(robot, action), None, torch.zeros(2, dtype=torch.bool))
+    for _ in ControlLoop(pupil, protocol, rows).run():
+        pass
+    lessons = Lessons.joined(pupil.lessons)
+    assert len(lessons.action) == (2 * 10 if kept else 0)
+    assert np.allclose(lessons.action, action, atol=1e-5)
+
+
 def test_lessons_do_not_depend_on_the_number_of_workers():
     protocol = short_protocol()
     one, two = (record("hold", protocol, POOL, 30, seed=2, workers=n) for n in (1, 2))
@@ -72,9 +110,10 @@ def test_fit_finds_a_linear_teacher():
     rng = np.random.default_rng(0)
     seen = rng.normal(3.0, 2.0, (20_000, INPUTS)).astype(np.float32)
     action = (0.2 * (seen[:, :14] - 3.0)).astype(np.float32)
-    actor, error = fit(Lessons(seen, action), seed=0, epochs=10, batch=500)
-    assert error < 0.05  # of 0.4
-    again, same = fit(Lessons(seen, action), seed=0, epochs=10, batch=500)
+    scale = np.full(14, 0.5)
+    actor, error = fit(Lessons(seen, action), scale, seed=0, epochs=10, batch=500)
+    assert error < 0.025  # [rad] of 0.2
+    again, same = fit(Lessons(seen, action), scale, seed=0, epochs=10, batch=500)
     assert error == same and torch.equal(actor.mlp[0].weight, again.mlp[0].weight)
 
 

@@ -187,8 +187,8 @@ def test_time_outs_are_bootstrapped():
     torch.testing.assert_close(stored[1:], step.reward[1:])
 
 
-def test_noise_and_curriculum_follow_the_budget():
-    t = trainer(curriculum=0.5, std_legs=(0.4, 0.1), std_arm=(1.0, 0.01), std_share=0.5)
+def test_noise_and_curriculum_follow_the_samples():
+    t = trainer(curriculum=96.0, std_legs=(0.4, 0.1), std_arm=(1.0, 0.01), std_steps=96.0)
     noise, ramp = [], []
     while not t.done:
         found = t.iterate()
@@ -200,13 +200,13 @@ def test_noise_and_curriculum_follow_the_budget():
     np.testing.assert_allclose(ramp, [0, 0.5, 1, 1])
 
 
-def test_disturbances_rise_with_the_budget():
-    t = trainer(calm=(0.25, 0.75))
+def test_disturbances_rise_with_the_samples():
+    t = trainer(calm=(48.0, 144.0))
     assert t.environment.severity == 0.0
     found = [t.iterate()["episode/severity"] for _ in range(4)]
     np.testing.assert_allclose(found, [0.0, 0.0, 0.5, 1.0])
     assert trainer().environment.severity == 1.0
-    for calm in ((0.5, 0.2), (0.3, 0.3), (-0.1, 0.5), (0.5, 1.5)):
+    for calm in ((5.0, 2.0), (3.0, 3.0), (-1.0, 5.0)):
         with pytest.raises(TrainingError, match=r"--calm .*valid: 0 <= begin"):
             replace(TINY, calm=calm).check()
 
@@ -222,7 +222,7 @@ def test_policy_and_critic_have_rates_of_their_own():
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("std_share", 0.0), ("std_legs", (0.1, 0.0)), ("std_arm", (-1.0, 0.1))]
+    ("name", "value"), [("std_steps", 0.0), ("std_legs", (0.1, 0.0)), ("std_arm", (-1.0, 0.1))]
 )
 def test_noise_that_cannot_be_is_refused(name, value):
     with pytest.raises(TrainingError, match=f"--{name.replace('_', '-')} .*valid: more than 0"):
@@ -278,12 +278,13 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
 def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     """Every reward term is logged; a longer budget goes on; other settings are refused by name."""
     folder = RunFolder(tmp_path / TINY.name)
-    constant = replace(TINY, std_legs=(0.4, 0.4), std_arm=(1.0, 1.0))  # a schedule knows the budget
-    run(replace(constant, budget=2 * 48), folder, tensorboard=False)
-    assert is_done(folder, replace(constant, budget=96)) and not is_done(folder, constant)
+    schedules = {"std_steps": 150.0, "curriculum": 150.0, "calm": (48.0, 144.0)}
+    settings = replace(TINY, **schedules)  # which do not know the budget
+    run(replace(settings, budget=2 * 48), folder, tensorboard=False)
+    assert is_done(folder, replace(settings, budget=96)) and not is_done(folder, settings)
     with folder.metrics.open("a") as file:
         file.write('{"iteration": 3, "samp')  # as a kill would leave it
-    run(constant, folder)
+    run(settings, folder)
     rows = folder.read_metrics()
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
     assert [row["samples"] for row in rows] == [48, 96, 144, 192]
@@ -292,15 +293,15 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     assert {f"reward/{name}" for name in SCALES} <= rows[0].keys()
     assert any((folder.path / "tensorboard").iterdir())
     assert not folder.claim.exists()
-    unbroken = trainer(std_legs=constant.std_legs, std_arm=constant.std_arm)
+    unbroken = trainer(**schedules)
     while not unbroken.done:
         unbroken.iterate()
-    resumed = trainer()
+    resumed = trainer(**schedules)
     runs.load_resume(resumed, folder)
     assert_equal(unbroken.save(), resumed.save())
     assert checkpoint.load(folder.checkpoint).card.samples == 192
     with pytest.raises(TrainingError, match=r"gamma 0\.99 -> 0\.9"):
-        run(replace(constant, gamma=0.9), folder)
+        run(replace(settings, gamma=0.9), folder)
 
 
 def test_a_killed_run_resumes(tmp_path):

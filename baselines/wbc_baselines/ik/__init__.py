@@ -1,7 +1,8 @@
 """`ik`: whole-body inverse kinematics over the floating base.
 
 Variants: `ik` (PlaCo), `ik:osqp` (the same program on Pinocchio and OSQP), `ik:kinematic` (PlaCo without
-feed-forward and feedback: what is left is the whole-body IK alone).
+feed-forward and feedback: what is left is the whole-body IK alone) and
+`ik:standing` (PlaCo that never lifts a foot).
 """
 
 from dataclasses import replace
@@ -11,16 +12,20 @@ from wbc_baselines.ik.settings import TUNED
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.robot import Robot
 
-VARIANTS = ("", "kinematic", "osqp")
+CHANGES: dict[str, dict[str, bool]] = {  # of the settings
+    "": {},
+    "kinematic": {"feedforward": False, "feedback": False, "stepping": False},
+    "osqp": {},
+    "standing": {"stepping": False},
+}
+VARIANTS = tuple(CHANGES)
 
 
 def make(robot: Robot, variant: str = "") -> IKController:
     """The controller of a variant. Raises: UnknownNameError."""
     if variant not in VARIANTS:
         raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
-    settings = (
-        replace(TUNED, feedforward=False, feedback=False, stepping=False) if variant == "kinematic" else TUNED
-    )
+    settings = replace(TUNED, **CHANGES[variant])
     # imported here: each solver is needed only by its own variant
     if variant == "osqp":
         from wbc_baselines.ik.osqp_ik import OsqpIK as Solver

@@ -135,13 +135,15 @@ class Imitate:
 
     path: Path
     """Where to: PATH.safetensors, a checkpoint that `wbc-bench eval --controller learned:PATH` can judge."""
-    teacher: str = "ik"
+    teacher: str = "ik:standing"
     """SPEC of the controller to imitate."""
     protocol: str = "ablation_v1"
     """Whose targets, randomisation, noise and pushes."""
-    episodes: int = 300
+    severity: float = 0.0
+    """Part of that randomisation, noise and those pushes: none at 0, all at 1."""
+    episodes: int = 150
     """Episodes a round."""
-    rounds: int = 3
+    rounds: int = 8
     """Rounds; the student drives in none of the first's episodes, and in ever more of the later ones'."""
     seed: int = 0
     """Seed of draws and weights."""
@@ -155,12 +157,15 @@ class Imitate:
         from wbc_baselines.learned.estimators import make_estimator
         from wbc_baselines.learned.imitation import METHOD, imitate
         from wbc_baselines.learned.pool import read_pool
+        from wbc_baselines.learned.starts import weakened
         from wbc_bench.progress import Progress
         from wbc_bench.protocol import find_protocol
 
         for name in ("episodes", "rounds", "workers"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"--{name} {getattr(self, name)}: valid: 1 or more")
+        if not 0.0 <= self.severity <= 1.0:
+            raise TrainingError(f"--severity {self.severity:g}: valid: 0 to 1")
         if self.path.suffix != ".safetensors":
             raise TrainingError(f"--path '{self.path}': valid: a name that ends in .safetensors")
         protocol, _ = find_protocol(self.protocol)
@@ -168,7 +173,7 @@ class Imitate:
         with Progress("episodes") as progress:
             actor, error = imitate(
                 self.teacher,
-                protocol,
+                weakened(protocol, self.severity),
                 read_pool(protocol),
                 self.episodes,
                 self.rounds,
@@ -178,7 +183,7 @@ class Imitate:
             )
         card = checkpoint.new_card(METHOD, self.seed, 0, time.monotonic() - begun, protocol)
         checkpoint.save(self.path, actor, make_estimator("none"), card)
-        print(f"{self.path}: root mean square error of an action {error:.3f}")
+        print(f"{self.path}: root mean square error of a joint's command {error:.3f} rad")
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import torch
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import huber_loss
 
 from wbc_baselines.learned.checkpoint import new_card
 from wbc_baselines.learned.controller import LearnedController
@@ -36,12 +37,16 @@ from wbc_bench.episodes import STRATA
 from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.randomness import stream
-from wbc_bench.robot import Robot, load_robot
+from wbc_bench.robot import NUM_LEG_JOINTS, Robot, load_robot
 
 METHOD = "no_latent"  # the one whose policy has no context
 SHARD = 25  # episodes that are recorded together
 INPUTS = OBSERVATION + COMMAND
-LIMIT = 3.0  # of a normalised action; choice: an answer beyond it is one to a fall, and not to be learned
+# Of a leg's normalised action; choice: an answer beyond it is one to a fall, and not to be learned. The arm's
+# scales are small (0.2 and 0.3 rad), so that what it needs to reach a target is often 5 and more.
+LIMIT = 3.0
+MOST = 0.9  # of a round's episodes that the student drives; choice
+DELTA = 0.05  # [rad] of the Huber loss; choice
 
 Progress = Callable[[int, int], None]
 
@@ -100,7 +105,7 @@ class Pupil:
         wanted = self._robot.action_of(self._teacher.act(obs, target).q)
         self._driver.answer = torch.from_numpy(wanted.astype(np.float32))
         command = self._hands.act(obs, target)
-        sound = obs.active & (np.abs(wanted) < LIMIT).all(axis=1)
+        sound = obs.active & (np.abs(wanted[:, :NUM_LEG_JOINTS]) < LIMIT).all(axis=1)
         self.lessons.append(Lessons(self._driver.seen.numpy()[sound], wanted[sound].astype(np.float32)))
         return command
 
@@ -183,30 +188,42 @@ def draw_rows(
 
 
 def fit(
-    lessons: Lessons, seed: int, epochs: int = 20, batch: int = 4096, learning_rate: float = 1e-3
+    lessons: Lessons,
+    scale: NDArray[np.float64],
+    seed: int,
+    start: Actor | None = None,
+    epochs: int = 8,
+    batch: int = 1024,
+    learning_rate: float = 1e-3,
 ) -> tuple[Actor, float]:
-    """The policy that answers most like the teacher, and its root mean square error on a tenth held out.
+    """The policy that answers most like the teacher, and its root mean square error [rad] on those held out.
 
-    Normalisers are those of the lessons; the learning rate falls to zero along a cosine.
+    Joints count by the angles asked for, so actions times their `scale` (14,) [rad]; errors beyond DELTA
+    count linearly, since what a teacher answers to a robot that is lost is wild. It goes on from a `start`,
+    in place; without one, from random weights with the lessons' normalisers. The newest fiftieth of the
+    lessons is held out. The learning rate falls to zero along a cosine.
     """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     seen, action = map(torch.from_numpy, lessons)
-    held = len(seen) // 10  # the last ones, which are whole episodes
-    actor = Actor(0)
-    actor.normalizer.update(seen)
+    radians = torch.tensor(scale, dtype=torch.float32)
+    held = len(seen) // 50  # the last ones, which are whole episodes
+    actor = start
+    if actor is None:
+        actor = Actor(0)
+        actor.normalizer.update(seen)
     optimizer = torch.optim.Adam(actor.mlp.parameters(), learning_rate)
     known = len(seen) - held
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * -(-known // batch))
     for _ in range(epochs):
         for chosen in torch.randperm(known, generator=generator).split(batch):
-            loss = (actor(seen[chosen]) - action[chosen]).square().mean()
+            loss = huber_loss(radians * actor(seen[chosen]), radians * action[chosen], delta=DELTA)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             schedule.step()
     with torch.no_grad():
-        error = (actor(seen[known:]) - action[known:]).square().mean().sqrt()
+        error = (radians * (actor(seen[known:]) - action[known:])).square().mean().sqrt()
     return actor.eval(), float(error)
 
 
@@ -220,11 +237,12 @@ def imitate(
     workers: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Actor, float]:
-    """DAgger: `rounds` of `episodes` each, the student driving a part k / rounds of those of round k.
+    """DAgger: `rounds` of `episodes` each; the student drives a quarter more of them every round, up to MOST.
 
-    Returns the policy fitted to all lessons, and its root mean square error on the newest tenth.
+    Returns the policy fitted to all lessons, and its root mean square error [rad] on the newest fiftieth.
     """
     parts: list[Lessons] = []
+    scale = load_robot(protocol.robot).action_scale
     student, error = None, float("nan")
     for k in range(rounds):
 
@@ -232,8 +250,9 @@ def imitate(
             progress(before + done, rounds * episodes)
 
         key = seed * rounds + k
-        parts.append(record(spec, protocol, pool, episodes, key, student, k / rounds, workers, told))
-        student, error = fit(Lessons.joined(parts), seed)
+        share = min(MOST, k / 4)
+        parts.append(record(spec, protocol, pool, episodes, key, student, share, workers, told))
+        student, error = fit(Lessons.joined(parts), scale, seed, student)
     assert student is not None
     return student, error
 

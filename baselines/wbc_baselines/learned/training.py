@@ -66,7 +66,7 @@ def make_environment(settings: Settings, pool: TargetPool | None = None) -> Envi
     if pool is None:
         pool = read_pool(find_protocol(settings.protocol)[0])
     reward = METHODS[settings.method].reward
-    return Environment(protocol, backend, pool, reward, settings.seed, settings.severity(0.0))
+    return Environment(protocol, backend, pool, reward, settings.seed, settings.severity(0))
 
 
 class Rollout:
@@ -196,12 +196,11 @@ class Trainer:
     def iterate(self) -> dict[str, float]:
         """Roll out, update policy and estimator; what is worth logging, by name."""
         settings, environment, ppo = self.settings, self.environment, self.ppo
-        part = self.iteration / settings.iterations
         torch.manual_seed(_key(settings.seed, "iteration", self.iteration))
-        legs, arm = settings.std(part)
+        legs, arm = settings.std(self.samples)
         self._log_std[:NUM_LEG_JOINTS], self._log_std[NUM_LEG_JOINTS:] = math.log(legs), math.log(arm)
-        environment.curriculum = min(1.0, part / settings.curriculum) if settings.curriculum else 1.0
-        environment.severity = settings.severity(part)
+        environment.curriculum = settings.ramp(self.samples)
+        environment.severity = settings.severity(self.samples)
         environment.clear_log()
         environment.begin_rollout(self.iteration, settings.steps)
         clock = [time.perf_counter()]
