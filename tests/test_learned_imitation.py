@@ -12,7 +12,7 @@ from tensordict import TensorDict  # noqa: E402
 from test_learned_environment import POOL  # noqa: E402
 from test_learned_training import trainer  # noqa: E402
 
-from wbc_baselines.learned import checkpoint  # noqa: E402
+from wbc_baselines.learned import checkpoint, imitation  # noqa: E402
 from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.cli import main  # noqa: E402
 from wbc_baselines.learned.estimators import make_estimator  # noqa: E402
@@ -26,12 +26,15 @@ from wbc_baselines.learned.imitation import (  # noqa: E402
     record,
 )
 from wbc_baselines.learned.networks import Actor  # noqa: E402
+from wbc_baselines.learned.symmetry import input_mirror  # noqa: E402
 from wbc_bench.control_loop import ControlLoop  # noqa: E402
 from wbc_bench.controller import ControllerInfo, JointCommand  # noqa: E402
 from wbc_bench.protocol import find_protocol  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
-ACTION = slice(34, 48)  # of the observation: the action of the step before
+JOINTS, ACTION = slice(6, 20), slice(34, 48)  # of the observation: positions; the action of the step before
+TARGET_Y = 59
+ROBOT = load_robot()
 
 
 def short_protocol():
@@ -106,14 +109,19 @@ def test_lessons_do_not_depend_on_the_number_of_workers():
     assert np.array_equal(one.seen, two.seen) and len(one.seen) == 30 * 10
 
 
-def test_fit_finds_a_linear_teacher():
+def test_fit_finds_a_linear_teacher_and_its_mirror_image():
+    """All lessons have the target on the left, where the first arm joint turns by one unit."""
     rng = np.random.default_rng(0)
-    seen = rng.normal(3.0, 2.0, (20_000, INPUTS)).astype(np.float32)
-    action = (0.2 * (seen[:, :14] - 3.0)).astype(np.float32)
-    scale = np.full(14, 0.5)
-    actor, error = fit(Lessons(seen, action), scale, seed=0, epochs=10, batch=500)
-    assert error < 0.025  # [rad] of 0.2
-    again, same = fit(Lessons(seen, action), scale, seed=0, epochs=10, batch=500)
+    seen = rng.normal(0.0, 2.0, (20_000, INPUTS)).astype(np.float32)
+    seen[:, TARGET_Y] = 1.0 + np.abs(seen[:, TARGET_Y])
+    action = 0.2 * seen[:, JOINTS]
+    action[:, 8] = 1.0
+    actor, error = fit(Lessons(seen, action), ROBOT, seed=0, updates=400, batch=500)
+    assert error < 0.04  # [rad] of 0.20
+    with torch.no_grad():
+        left, right = (actor(torch.from_numpy(x))[:, 8].mean() for x in (seen, input_mirror(ROBOT)(seen)))
+    assert left == pytest.approx(1.0, abs=0.2) and right == pytest.approx(-1.0, abs=0.2)
+    again, same = fit(Lessons(seen, action), ROBOT, seed=0, updates=400, batch=500)
     assert error == same and torch.equal(actor.mlp[0].weight, again.mlp[0].weight)
 
 
@@ -154,16 +162,31 @@ def test_the_normaliser_of_a_start_counts():
     assert torch.allclose(t.actor().normalizer.mean, torch.ones(INPUTS))
 
 
+def test_disturbances_rise_after_the_calm_rounds(monkeypatch):
+    protocol, heard = short_protocol(), []
+
+    def fake(spec, disturbed, pool, episodes, key, student, share, *_):
+        heard.append((key, disturbed.push.speed / protocol.push.speed, share))
+        return Lessons(np.zeros((100, INPUTS), np.float32), np.zeros((100, 14), np.float32))
+
+    monkeypatch.setattr(imitation, "record", fake)
+    imitation.imitate("hold", protocol, POOL, 2, rounds=6, seed=1, calm=2, updates=1)
+    keys, severity, share = zip(*heard, strict=True)
+    assert keys == (6, 7, 8, 9, 10, 11)
+    np.testing.assert_allclose(severity, [0, 0, 0.25, 0.5, 0.75, 1])
+    np.testing.assert_allclose(share, [0, 0.25, 0.5, 0.75, 0.9, 0.9])
+
+
 def test_imitate_writes_a_checkpoint_that_an_evaluation_reads(tmp_path, capsys):
     path = tmp_path / "start.safetensors"
-    with pytest.raises(SystemExit) as stop:
-        main(["imitate", "--path", str(tmp_path / "start.pt")])
-    assert stop.value.code == 2 and "ends in .safetensors" in capsys.readouterr().err
-    main(
-        [
-            *("imitate", "--path", str(path), "--teacher", "hold", "--episodes", "2", "--rounds", "2"),
-            "--workers=1",
-        ]
-    )
+    for options, message in (
+        (["--path", str(tmp_path / "start.pt")], "ends in .safetensors"),
+        (["--path", str(path), "--rounds", "2", "--calm", "2"], "--calm 2: valid: 0 to 1"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(["imitate", *options])
+        assert stop.value.code == 2 and message in capsys.readouterr().err
+    small = ("--episodes", "2", "--rounds", "2", "--calm", "1", "--updates", "20", "--workers", "1")
+    main(["imitate", "--path", str(path), "--teacher", "hold", *small])
     card = checkpoint.load(path).card
     assert (card.method, card.samples) == ("no_latent", 0)

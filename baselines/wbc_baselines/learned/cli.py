@@ -139,12 +139,14 @@ class Imitate:
     """SPEC of the controller to imitate."""
     protocol: str = "ablation_v1"
     """Whose targets, randomisation, noise and pushes."""
-    severity: float = 0.0
-    """Part of that randomisation, noise and those pushes: none at 0, all at 1."""
     episodes: int = 150
     """Episodes a round."""
-    rounds: int = 8
+    rounds: int = 17
     """Rounds; the student drives in none of the first's episodes, and in ever more of the later ones'."""
+    calm: int = 13
+    """First rounds, without disturbances; then they rise to the protocol's in the last."""
+    updates: int = 3000
+    """Updates of the student after each round."""
     seed: int = 0
     """Seed of draws and weights."""
     workers: int = 2
@@ -157,15 +159,14 @@ class Imitate:
         from wbc_baselines.learned.estimators import make_estimator
         from wbc_baselines.learned.imitation import METHOD, imitate
         from wbc_baselines.learned.pool import read_pool
-        from wbc_baselines.learned.starts import weakened
         from wbc_bench.progress import Progress
         from wbc_bench.protocol import find_protocol
 
-        for name in ("episodes", "rounds", "workers"):
+        for name in ("episodes", "rounds", "updates", "workers"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"--{name} {getattr(self, name)}: valid: 1 or more")
-        if not 0.0 <= self.severity <= 1.0:
-            raise TrainingError(f"--severity {self.severity:g}: valid: 0 to 1")
+        if not 0 <= self.calm < self.rounds:
+            raise TrainingError(f"--calm {self.calm}: valid: 0 to {self.rounds - 1}, less than --rounds")
         if self.path.suffix != ".safetensors":
             raise TrainingError(f"--path '{self.path}': valid: a name that ends in .safetensors")
         protocol, _ = find_protocol(self.protocol)
@@ -173,11 +174,13 @@ class Imitate:
         with Progress("episodes") as progress:
             actor, error = imitate(
                 self.teacher,
-                weakened(protocol, self.severity),
+                protocol,
                 read_pool(protocol),
                 self.episodes,
                 self.rounds,
                 self.seed,
+                self.calm,
+                self.updates,
                 self.workers,
                 progress.update,
             )

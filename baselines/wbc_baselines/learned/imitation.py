@@ -22,7 +22,8 @@ from wbc_baselines.learned.inputs import COMMAND, OBSERVATION
 from wbc_baselines.learned.networks import Actor
 from wbc_baselines.learned.policy import flow_of
 from wbc_baselines.learned.pool import TargetPool
-from wbc_baselines.learned.starts import draw_starts
+from wbc_baselines.learned.starts import draw_starts, weakened
+from wbc_baselines.learned.symmetry import input_mirror, joint_mirror
 from wbc_bench.control_loop import ControlLoop
 from wbc_bench.controller import (
     Controller,
@@ -60,6 +61,11 @@ class Lessons(NamedTuple):
     @classmethod
     def joined(cls, parts: "list[Lessons]") -> "Lessons":
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    def with_mirror_images(self, robot: Robot) -> "Lessons":
+        """Twice the lessons: each also with left and right exchanged."""
+        images = Lessons(input_mirror(robot)(self.seen), joint_mirror(robot)(self.action))
+        return Lessons.joined([self, images])
 
 
 class _Driver:
@@ -189,41 +195,42 @@ def draw_rows(
 
 def fit(
     lessons: Lessons,
-    scale: NDArray[np.float64],
+    robot: Robot,
     seed: int,
     start: Actor | None = None,
-    epochs: int = 8,
+    updates: int = 3000,
     batch: int = 1024,
     learning_rate: float = 1e-3,
 ) -> tuple[Actor, float]:
-    """The policy that answers most like the teacher, and its root mean square error [rad] on those held out.
+    """The policy that answers most like the teacher, and its root mean square error [rad] on unseen lessons.
 
-    Joints count by the angles asked for, so actions times their `scale` (14,) [rad]; errors beyond DELTA
-    count linearly, since what a teacher answers to a robot that is lost is wild. It goes on from a `start`,
-    in place; without one, from random weights with the lessons' normalisers. The newest fiftieth of the
-    lessons is held out. The learning rate falls to zero along a cosine.
+    Every lesson counts with its mirror image. Joints count by the angles asked for, actions times the
+    action scale; errors beyond DELTA count linearly, since what a teacher answers to a robot that is lost is
+    wild. It goes on from a `start`, in place; without one, from random weights with the lessons' normalisers.
+    The newest fiftieth of the lessons is held out. The learning rate falls to zero along a cosine.
     """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    seen, action = map(torch.from_numpy, lessons)
-    radians = torch.tensor(scale, dtype=torch.float32)
-    held = len(seen) // 50  # the last ones, which are whole episodes
+    known = len(lessons.seen) - len(lessons.seen) // 50
+    held, kept = (Lessons(*(x[part] for x in lessons)) for part in (slice(known, None), slice(known)))
+    seen, action = map(torch.from_numpy, kept.with_mirror_images(robot))
+    radians = torch.tensor(robot.action_scale, dtype=torch.float32)
     actor = start
     if actor is None:
         actor = Actor(0)
         actor.normalizer.update(seen)
     optimizer = torch.optim.Adam(actor.mlp.parameters(), learning_rate)
-    known = len(seen) - held
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * -(-known // batch))
-    for _ in range(epochs):
-        for chosen in torch.randperm(known, generator=generator).split(batch):
-            loss = huber_loss(radians * actor(seen[chosen]), radians * action[chosen], delta=DELTA)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
+    for _ in range(updates):
+        chosen = torch.randint(len(seen), (batch,), generator=generator)
+        loss = huber_loss(radians * actor(seen[chosen]), radians * action[chosen], delta=DELTA)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
     with torch.no_grad():
-        error = (radians * (actor(seen[known:]) - action[known:])).square().mean().sqrt()
+        answers = actor(torch.from_numpy(held.seen))
+        error = (radians * (answers - torch.from_numpy(held.action))).square().mean().sqrt()
     return actor.eval(), float(error)
 
 
@@ -234,15 +241,20 @@ def imitate(
     episodes: int,
     rounds: int,
     seed: int,
+    calm: int = 0,
+    updates: int = 3000,
     workers: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Actor, float]:
     """DAgger: `rounds` of `episodes` each; the student drives a quarter more of them every round, up to MOST.
 
+    In the first `calm` rounds nothing disturbs the robot; then disturbances rise evenly, to the protocol's in
+    the last round.
+
     Returns the policy fitted to all lessons, and its root mean square error [rad] on the newest fiftieth.
     """
     parts: list[Lessons] = []
-    scale = load_robot(protocol.robot).action_scale
+    robot = load_robot(protocol.robot)
     student, error = None, float("nan")
     for k in range(rounds):
 
@@ -250,9 +262,10 @@ def imitate(
             progress(before + done, rounds * episodes)
 
         key = seed * rounds + k
-        share = min(MOST, k / 4)
-        parts.append(record(spec, protocol, pool, episodes, key, student, share, workers, told))
-        student, error = fit(Lessons.joined(parts), scale, seed, student)
+        share, severity = min(MOST, k / 4), max(0.0, (k + 1 - calm) / (rounds - calm))
+        disturbed = weakened(protocol, severity)
+        parts.append(record(spec, disturbed, pool, episodes, key, student, share, workers, told))
+        student, error = fit(Lessons.joined(parts), robot, seed, student, updates)
     assert student is not None
     return student, error
 
