@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import msgspec
 import numpy as np
@@ -46,6 +46,11 @@ TINY = Settings(
     threads=1,
     estimator_share=0.5,
     estimator_minibatches=2,
+    learning_rate=3e-4,
+    least_learning_rate=1e-4,
+    start="",
+    critic_iterations=0,
+    calm=(0.0, 0.0),
 )
 
 
@@ -309,8 +314,8 @@ def test_a_killed_run_resumes(tmp_path):
     code = (
         "import sys; from pathlib import Path; from wbc_baselines.learned import runs;"
         "from wbc_baselines.learned.settings import Settings; runs.CHECKPOINT_PERIOD = 0.0;"
-        "runs.run(Settings('no_latent', budget=1e9, envs=8, steps=6, minibatches=2, threads=1,"
-        "estimator_share=0.5, estimator_minibatches=2), runs.RunFolder(Path(sys.argv[1])), tensorboard=False)"
+        f"runs.run(Settings(**{asdict(replace(TINY, budget=1e9))}), runs.RunFolder(Path(sys.argv[1])),"
+        "tensorboard=False)"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(tmp_path)], env=os.environ | {"OMP_NUM_THREADS": "1"}

@@ -30,11 +30,11 @@ class Settings:
     """Control steps of a rollout."""
     epochs: int = 2
     """Passes of PPO over a rollout."""
-    minibatches: int = 8
+    minibatches: int = 4
     """Parts of a rollout in one pass."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 3e-5
     """Of the policy at the start; then adapted to `desired_kl`."""
-    least_learning_rate: float = 1e-4
+    least_learning_rate: float = 1e-5
     """Below which it is not adapted."""
     critic_learning_rate: float = 5e-4
     """Of the critic, throughout."""
@@ -48,19 +48,19 @@ class Settings:
     """PPO's clip."""
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
-    start: str = ""
-    """Checkpoint without context that the policy begins with (`wbc-train imitate`); else random weights."""
+    start: str = "ik_student"
+    """Checkpoint without context that the policy begins with (`wbc-train imitate`); "" for random weights."""
     start_samples: int = 30_000_000
     """Observations that the start's normaliser counts for. With fewer, first falls shift it faster than the
     policy can follow: at 200,000 a start that stood for 2.9 s fell at 1.2 s half a million steps later,
     before any update of the policy."""
-    critic_iterations: int = 0
+    critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: tuple[float, float] = (0.4, 0.1)
+    std_legs: tuple[float, float] = (0.1, 0.08)
     """Standard deviation of the leg actions at the start and in the end."""
-    std_arm: tuple[float, float] = (1.0, 0.1)
+    std_arm: tuple[float, float] = (0.2, 0.1)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: float = 15e6
+    std_steps: float = 12e6
     """Control steps over which they fall, exponentially."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
@@ -68,7 +68,7 @@ class Settings:
     """Physics steps in a control period."""
     curriculum: float = 0.0
     """Control steps over which the strata ramp from mostly `arm` to the protocol's weights."""
-    calm: tuple[float, float] = (0.0, 0.0)
+    calm: tuple[float, float] = (1e6, 12e6)
     """Control steps from which on and until when noise, pushes and randomisation rise from none to the
     protocol's; before, there are none."""
     estimator_share: float = 0.125
