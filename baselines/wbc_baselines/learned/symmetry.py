@@ -18,13 +18,13 @@ POLAR, AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)  # signs of x, y, z
 
 
 class Mirror(NamedTuple):
-    """The mirror image of vectors x (..., K) is `x[..., index] * sign`."""
+    """The mirror image of vectors x (..., K) is `x[..., place] * sign`."""
 
-    index: NDArray[np.int64]  # (K,)
+    place: NDArray[np.int64]  # (K,)
     sign: NDArray[np.float32]  # (K,)
 
-    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        return x[..., self.index] * self.sign
+    def __call__(self, x: NDArray[np.floating]) -> NDArray[np.float32]:
+        return np.asarray(x[..., self.place] * self.sign, dtype=np.float32)
 
 
 def joint_mirror(robot: Robot) -> Mirror:
@@ -48,10 +48,10 @@ def input_mirror(robot: Robot) -> Mirror:
     polar, axial = (Mirror(np.arange(3), np.array(signs, np.float32)) for signs in (POLAR, AXIAL))
     pose = (polar, polar, axial)  # position, first and second column
     parts = (axial, polar, joints, joints, joints, *pose, same, *pose)
-    sizes = [len(part.index) for part in parts]
+    sizes = [len(part.place) for part in parts]
     assert sum(sizes) == width(OBSERVATION_LAYOUT) + width(COMMAND_LAYOUT)
     starts = np.cumsum([0, *sizes[:-1]])
     return Mirror(
-        np.concatenate([start + part.index for start, part in zip(starts, parts, strict=True)]),
+        np.concatenate([start + part.place for start, part in zip(starts, parts, strict=True)]),
         np.concatenate([part.sign for part in parts]),
     )
