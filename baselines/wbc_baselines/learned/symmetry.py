@@ -31,14 +31,13 @@ def joint_mirror(robot: Robot) -> Mirror:
     """Of joint angles, velocities and actions (..., 14), by the joints' axes."""
     model = robot.model()
     data = mujoco.MjData(model)
-    data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *np.zeros(NUM_JOINTS)]
-    mujoco.mj_kinematics(model, data)
+    mujoco.mj_kinematics(model, data)  # at joint angles of zero
     axes = data.xaxis[1:]  # after the free joint
     half = NUM_LEG_JOINTS // 2
     legs, arm = np.roll(np.arange(NUM_LEG_JOINTS), half), np.arange(NUM_LEG_JOINTS, NUM_JOINTS)
-    index = np.concatenate([legs, arm])
-    sign = np.round((axes[index] * AXIAL * axes).sum(axis=1))
-    return Mirror(index, sign.astype(np.float32))
+    place = np.concatenate([legs, arm])
+    sign = np.round((axes[place] * AXIAL * axes).sum(axis=1))
+    return Mirror(place, sign.astype(np.float32))
 
 
 def input_mirror(robot: Robot) -> Mirror:
