@@ -147,10 +147,22 @@ def test_first_only_the_critic_learns(tmp_path):
     assert not all(map(torch.equal, before, t.ppo.actor.mlp.parameters()))
 
 
-def test_a_start_has_no_context(tmp_path):
-    path = write(tmp_path / "a.safetensors", "cenet")
-    with pytest.raises(CheckpointError, match="is of cenet, valid: a method without a context"):
-        checkpoint.load_start(str(path))
+@pytest.mark.parametrize("method", ["cenet", "transformer_gru", "oracle"])
+def test_a_method_goes_on_from_a_checkpoint_of_its_own(method, tmp_path):
+    path = write(tmp_path, method)
+    t, start = trainer(method=method, start=str(path)), checkpoint.load(path)
+    inputs = torch.randn(5, INPUTS + t.estimator.context_dim)
+    assert torch.allclose(t.actor()(inputs), start.actor(inputs), atol=1e-6)
+    weights = dict(start.estimator.state_dict())
+    assert all(torch.equal(weights[name], value) for name, value in t.estimator.state_dict().items())
+    if weights:
+        assert t.estimator.normalizer.count == t.settings.start_samples
+
+
+def test_a_start_has_no_context_or_the_methods_own(tmp_path):
+    path = write(tmp_path, "cenet")
+    with pytest.raises(CheckpointError, match="is of cenet, valid: a method without a context, or with"):
+        checkpoint.load_start(str(path), "gru")
 
 
 def test_the_normaliser_of_a_start_counts():

@@ -83,6 +83,8 @@ class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     git_commit: str | None
     git_dirty: bool
     dimensions: Dimensions
+    start: str = ""  # name and SHA-256 of the checkpoint that it began with
+    teacher: str = ""  # and of the one that it imitated at first
     sha256: str = ""  # of the safetensors file
 
 
@@ -212,17 +214,37 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
     return Checkpoint(card, actor.eval(), estimator.eval())
 
 
-def load_start(name: str) -> Actor:
-    """The policy of a checkpoint that other methods can begin with: one without context.
+def identity(name: str) -> str:
+    """Name and SHA-256 of a checkpoint's weights, for the card of one that comes from it; "" of no name."""
+    return f"{find(name).stem} {read_card(find(name)).sha256}" if name else ""
 
-    Raises: CheckpointError, it has a context; and see `load`.
+
+def load_start(name: str, estimator: str) -> Checkpoint:
+    """A checkpoint that a method with this estimator can begin with: without context, or with the same estimator.
+
+    Raises: CheckpointError, it has another; and see `load`.
     """
     found = load(find(name))
-    if found.estimator.context_dim:
+    theirs = METHODS[found.card.method].estimator
+    if theirs not in ("none", estimator):
         raise CheckpointError(
-            f"--start '{name}' is of {found.card.method}, valid: a method without a context"
+            f"--start '{name}' is of {found.card.method}, valid: a method without a context, or with "
+            f"the estimator '{estimator}'"
         )
-    return found.actor
+    return found
+
+
+def load_teacher(name: str) -> Checkpoint:
+    """A checkpoint whose answer to a state does not depend on those before it.
+
+    Raises: CheckpointError, its context is estimated; and see `load`.
+    """
+    found = load(find(name))
+    if found.estimator.trainable:
+        raise CheckpointError(
+            f"--teacher '{name}' is of {found.card.method}, valid: a method without an estimated context"
+        )
+    return found
 
 
 def read_card(path: Path) -> Card:

@@ -49,11 +49,17 @@ class Settings:
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
     start: str = "ik_student"
-    """Checkpoint without context that the policy begins with (`wbc-train imitate`); "" for random weights."""
+    """Checkpoint that the policy begins with: one without context (`wbc-train imitate`), or one with the same
+    estimator, which begins with it as well; "" for random weights."""
     start_samples: int = 30_000_000
     """Observations that the start's normaliser counts for. With fewer, first falls shift it faster than the
     policy can follow: at 200,000 a start that stood for 2.9 s fell at 1.2 s half a million steps later,
     before any update of the policy."""
+    teacher: str = ""
+    """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
+    teacher_steps: float = 3e6
+    """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In the
+    first half the teacher drives in a part of the environments, at first in all."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
     std_legs: tuple[float, float] = (0.1, 0.08)
@@ -105,6 +111,10 @@ class Settings:
         begin, end = self.calm
         return max(0.0, (samples - begin) / (end - begin)) if samples < end else 1.0
 
+    def taught(self, samples: int) -> float:
+        """Part of the teacher's time that is over, in [0, 1], after so many control steps; 1 without one."""
+        return min(1.0, samples / self.teacher_steps) if self.teacher else 1.0
+
     def ramp(self, samples: int) -> float:
         """Part of the curriculum that is done, in [0, 1], after so many control steps."""
         return samples / self.curriculum if samples < self.curriculum else 1.0
@@ -124,6 +134,7 @@ class Settings:
                 raise TrainingError(f"--{option} {getattr(self, name)}: valid: 1 or more")
         for option, values in (
             ("std-steps", (self.std_steps,)),
+            ("teacher-steps", (self.teacher_steps,)),
             ("std-legs", self.std_legs),
             ("std-arm", self.std_arm),
         ):

@@ -29,8 +29,9 @@ from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.networks import HIDDEN, Actor
 from wbc_baselines.learned.pool import TargetPool, read_pool
 from wbc_baselines.learned.settings import Settings, TrainingError
+from wbc_baselines.learned.teaching import Teaching
 from wbc_bench.protocol import EvalProtocol, find_protocol
-from wbc_bench.robot import NUM_LEG_JOINTS
+from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 
 def training_protocol(settings: Settings) -> EvalProtocol:
@@ -112,10 +113,19 @@ class Trainer:
         self.settings, self.environment = settings, environment
         self.method = METHODS[settings.method]
         self.iteration, self.device = 0, environment.device
+        self._origins = tuple(checkpoint.identity(name) for name in (settings.start, settings.teacher))
         if settings.backend == "cpu":
             torch.set_num_threads(settings.threads)
         torch.manual_seed(_key(settings.seed, "weights"))
         self.estimator = make_estimator(self.method.estimator).to(self.device)
+        start = None
+        if settings.start:
+            start = checkpoint.load_start(settings.start, self.method.estimator)
+            if start.estimator.context_dim:  # the same estimator: no weights in common otherwise
+                self.estimator.load_state_dict(start.estimator.state_dict())
+                for name, count in self.estimator.named_buffers():
+                    if name.endswith("normalizer.count"):
+                        count.fill_(settings.start_samples)
         self._privileged = self.method.estimator == "oracle"
         self._estimates = self.estimator.context_dim > 0 and not self._privileged
         seen = environment.seen
@@ -123,13 +133,14 @@ class Trainer:
         self._state = torch.zeros(environment.num_envs, self.estimator.state_dim, device=self.device)
         self._start = torch.ones(environment.num_envs, dtype=torch.bool, device=self.device)
         self._context = self._estimate() if self._estimates else None
-        self.ppo = self._make_ppo()
+        self.ppo = self._make_ppo(start)
+        self.teaching = self._make_teaching() if settings.teacher else None
         parameters = list(self.estimator.parameters())
         self.optimizer = (
             torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
         )
 
-    def _make_ppo(self) -> PPO:
+    def _make_ppo(self, start: checkpoint.Checkpoint | None) -> PPO:
         settings, seen = self.settings, self._observations()
         # the critic sees what the oracle's context holds already
         groups = {"actor": ["policy"], "critic": ["critic"]}
@@ -143,9 +154,9 @@ class Trainer:
         critic = MLPModel(seen, groups, "critic", 1, **common)
         self._log_std: Tensor = actor.distribution.log_std_param  # type: ignore[union-attr, assignment]
         self._log_std.requires_grad_(False)  # follows a schedule, see `iterate`
-        if settings.start:
+        if start:
             with torch.no_grad():
-                begin_with(actor, checkpoint.load_start(settings.start), settings.start_samples)
+                begin_with(actor, start.actor, settings.start_samples)
         storage = RolloutStorage("rl", settings.envs, settings.steps, seen, [ACTIONS], str(self.device))
         ppo = PPO(
             actor,
@@ -169,7 +180,7 @@ class Trainer:
 
         def set_rates(optimizer: torch.optim.Optimizer, *_: object) -> None:
             ppo.learning_rate = max(ppo.learning_rate, settings.least_learning_rate)
-            if self.iteration < settings.critic_iterations:
+            if self.iteration < settings.critic_iterations or self._taught < 1:
                 ppo.learning_rate = settings.learning_rate  # a policy at rest has no divergence to adapt to
                 for parameter in actor.parameters():
                     parameter.grad = None
@@ -181,12 +192,23 @@ class Trainer:
         ppo.optimizer.register_step_pre_hook(set_rates)
         return ppo
 
+    def _make_teaching(self) -> Teaching:
+        teacher = checkpoint.load_teacher(self.settings.teacher)
+        scale = load_robot(self.environment.protocol.robot).action_scale
+        return Teaching(
+            teacher, self.ppo.actor, torch.tensor(scale, dtype=torch.float32, device=self.device)
+        )
+
     # ---- one iteration -------------------------------------------------------------------------------------
 
     @property
     def samples(self) -> int:
         """Control steps so far."""
         return self.iteration * self.settings.envs * self.settings.steps
+
+    @property
+    def _taught(self) -> float:
+        return self.settings.taught(self.samples)
 
     @property
     def done(self) -> bool:
@@ -209,6 +231,8 @@ class Trainer:
         with torch.no_grad():
             ppo.compute_returns(self._observations())
         losses = ppo.update()
+        if self.teaching and self._taught < 1:
+            losses |= self.teaching.update(ppo.storage.observations, self._taught)
         clock.append(time.perf_counter())
         losses |= self._update_estimator(rollout) if rollout else {}
         clock.append(time.perf_counter())
@@ -239,10 +263,16 @@ class Trainer:
             ids = torch.randperm(settings.envs, device=self.device)[: settings.estimator_envs]
             rollout = Rollout(settings.steps, ids, self._state_before)
         observations = self._observations()
+        teaching = self.teaching if self._taught < 0.5 else None
+        # the last of the environments, fewer and fewer
+        drives = torch.arange(settings.envs, device=self.device) >= 2 * self._taught * settings.envs
         for t in range(settings.steps):
             if rollout:
                 rollout.before(t, self._history.window, self._start, environment.seen.velocity)
             action = ppo.act(observations)
+            if teaching:  # with the policy's exploration
+                noise = action - ppo.transition.distribution_params[0]  # type: ignore[index]
+                action = torch.where(drives[:, None], teaching.answer(observations) + noise, action)
             step = environment.step(action)
             if rollout:
                 rollout.after(t, step)
@@ -310,6 +340,7 @@ class Trainer:
         settings = self.settings
         protocol, _ = find_protocol(settings.protocol)
         card = checkpoint.new_card(settings.method, settings.seed, self.samples, seconds, protocol)
+        card = msgspec.structs.replace(card, start=self._origins[0], teacher=self._origins[1])
         checkpoint.save(path, self.actor(), self.estimator, card)
 
     def save(self) -> dict:
@@ -323,6 +354,7 @@ class Trainer:
             "learning_rate": self.ppo.learning_rate,
             "estimator": self.estimator.state_dict() | counts,
             "optimizer": self.optimizer.state_dict() if self.optimizer else {},
+            "teaching": self.teaching.optimizer.state_dict() if self.teaching else {},
             "environment": self.environment.save(),
             "history": self._history.window,
             "state": self._state,
@@ -345,6 +377,8 @@ class Trainer:
         )
         if self.optimizer:
             self.optimizer.load_state_dict(saved["optimizer"])
+        if self.teaching:
+            self.teaching.optimizer.load_state_dict(saved["teaching"])
         self.environment.load(saved["environment"])
         self._history.window = saved["history"].to(self.device)
         self._state, self._start = saved["state"].to(self.device), saved["start"].to(self.device)
