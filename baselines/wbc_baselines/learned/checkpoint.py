@@ -220,7 +220,7 @@ def identity(name: str) -> str:
 
 
 def load_start(name: str, estimator: str) -> Checkpoint:
-    """A checkpoint that a method with this estimator can begin with: without context, or with the same estimator.
+    """A checkpoint that a method with this estimator can begin with: without context, or with the same.
 
     Raises: CheckpointError, it has another; and see `load`.
     """

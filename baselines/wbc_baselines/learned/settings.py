@@ -58,8 +58,8 @@ class Settings:
     teacher: str = ""
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
     teacher_steps: float = 3e6
-    """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In the
-    first half the teacher drives in a part of the environments, at first in all."""
+    """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
+    the first half the teacher drives in a part of the environments, at first in all."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
     std_legs: tuple[float, float] = (0.1, 0.08)

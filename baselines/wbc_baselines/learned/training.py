@@ -195,9 +195,7 @@ class Trainer:
     def _make_teaching(self) -> Teaching:
         teacher = checkpoint.load_teacher(self.settings.teacher)
         scale = load_robot(self.environment.protocol.robot).action_scale
-        return Teaching(
-            teacher, self.ppo.actor, torch.tensor(scale, dtype=torch.float32, device=self.device)
-        )
+        return Teaching(teacher, self.ppo.actor, torch.tensor(scale, dtype=torch.float32, device=self.device))
 
     # ---- one iteration -------------------------------------------------------------------------------------
 
