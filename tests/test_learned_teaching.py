@@ -1,5 +1,6 @@
 """A teacher beside training: what it answers, who drives, what is learned, and that a run resumes."""
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -13,8 +14,12 @@ from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder  # noqa: E402
 from wbc_baselines.learned.settings import TrainingError  # noqa: E402
+from wbc_baselines.learned.teaching import ARRIVES, BLEND, SETS_OUT  # noqa: E402
+from wbc_bench.robot import load_robot  # noqa: E402
 
 STEPS = TINY.envs * TINY.steps  # of an iteration
+REFERENCE = 57  # column of d_ref
+ROBOT = load_robot()
 
 
 @pytest.mark.parametrize("method", ["no_latent", "oracle"])
@@ -69,6 +74,7 @@ def test_returns_do_not_touch_the_policy_while_it_is_taught(tmp_path, monkeypatc
 
 def test_a_taught_run_resumes_bit_by_bit(tmp_path):
     changes = {"teacher": str(write(tmp_path, "oracle")), "teacher_steps": 3 * STEPS, "method": "gru"}
+    changes |= {"arm_teaching": (STEPS, 4 * STEPS)}
     unbroken, broken = trainer(**changes), trainer(**changes)
     folder = RunFolder(tmp_path / "gru@0")
     folder.open(broken.settings)
@@ -89,3 +95,50 @@ def test_a_teacher_has_no_memory(tmp_path):
         checkpoint.load_teacher(str(write(tmp_path, "gru")))
     with pytest.raises(TrainingError, match="--teacher-steps 0: valid: more than 0"):
         trainer(teacher_steps=0)
+
+
+def arm_trainer(**changes):
+    return trainer(**({"arm_teaching": (0.0, 3 * STEPS)} | changes))
+
+
+def test_the_arm_sets_out_as_the_reference_falls_and_bears_its_weight():
+    t = arm_trainer()
+    observations = t._observations()
+    critic = observations["critic"]
+    scale, kp = ROBOT.action_scale[8:], ROBOT.kp[8:]
+    q = ROBOT.default_q[8:] + critic[:, 14:20].numpy()
+    weight = t.arm_teaching._arm.holding_torque(torch.tensor(q).float(), critic[:, 3:6]).numpy() / kp
+    critic[:, REFERENCE] = SETS_OUT
+    np.testing.assert_allclose(t.arm_teaching.answer(observations), weight / scale, atol=1e-5)
+    critic[:, REFERENCE] = ARRIVES
+    arrived = t.arm_teaching.answer(observations).numpy() * scale - weight
+    there = t.arm_teaching._arm.solve(torch.tensor(q).float(), critic[:, 58:67]).numpy()
+    np.testing.assert_allclose(arrived, there - ROBOT.default_q[8:], atol=1e-4)
+    critic[:, REFERENCE] = (SETS_OUT + ARRIVES) / 2
+    half = t.arm_teaching.answer(observations).numpy() * scale - weight
+    np.testing.assert_allclose(half, arrived / 2, atol=1e-4)
+
+
+def test_a_lesson_moves_the_arm_a_part_of_the_way_and_leaves_the_legs(monkeypatch):
+    t = arm_trainer()
+    t.environment.begin_rollout(0, TINY.steps)
+    t._roll_out()
+    seen = t.ppo.storage.observations.flatten(0, 1)
+    own, answer = t.ppo.actor(seen).detach(), t.arm_teaching.answer(seen)
+    lessons = []
+    monkeypatch.setattr(t.arm_teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
+    t.arm_teaching.update(t.ppo.storage.observations)
+    torch.testing.assert_close(lessons[0][:, :8], own[:, :8])
+    torch.testing.assert_close(lessons[0][:, 8:], own[:, 8:] + BLEND * (answer - own[:, 8:]))
+
+
+def test_the_arm_is_taught_beside_ppo_while_it_is_time():
+    t = arm_trainer(arm_teaching=(STEPS, 3 * STEPS))
+    taught = ["loss/arm_teaching" in t.iterate() for _ in range(4)]
+    assert taught == [False, True, True, False]
+
+
+def test_the_arm_comes_nearer_to_what_it_is_taught():
+    t = arm_trainer(arm_teaching=(0.0, 1e6), learning_rate=1e-5, least_learning_rate=1e-5)
+    misses = [t.iterate()["loss/arm_teaching"] for _ in range(40)]
+    assert np.mean(misses[-5:]) < 0.7 * np.mean(misses[:5])

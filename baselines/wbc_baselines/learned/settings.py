@@ -60,6 +60,8 @@ class Settings:
     teacher_steps: float = 3e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
+    arm_teaching: tuple[float, float] = (0.0, 0.0)
+    """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
     std_legs: tuple[float, float] = (0.1, 0.08)

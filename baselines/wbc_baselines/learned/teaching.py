@@ -1,9 +1,9 @@
-"""A policy that learns from a teacher beside it: DAgger on the rollouts of training.
+"""A policy that learns from teachers beside it, in the states that its own rollouts meet.
 
-The teacher answers in every state that a rollout has met, the policy is fitted to the answers. That is far
-cheaper than finding out the same by reinforcement, and any method can learn it with the context that it has.
-Source: Ross, Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret
-online learning".
+What is known need not be found out by reinforcement. A teacher answers in every state of a rollout and the
+policy is fitted to the answers: a checkpoint that knows more (DAgger; PPO then takes over), or geometry for
+the joints of the arm alone, while PPO teaches the legs to carry it. Source: Ross, Gordon, Bagnell 2011, "A
+reduction of imitation learning and structured prediction to no-regret online learning".
 """
 
 import math
@@ -14,23 +14,55 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from wbc_baselines.learned.arm_ik import ArmKinematics
 from wbc_baselines.learned.checkpoint import Checkpoint
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS
 from wbc_baselines.learned.imitation import DELTA
+from wbc_baselines.learned.inputs import COMMAND, OBSERVATION
+from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 
 BATCH = 1024  # lessons an update; choice, as that of `imitation.fit`
-EPOCHS = 2  # over a rollout; choice
 RATE, LEAST_RATE = 1e-3, 5e-5  # of Adam, first and last; choice
+ARM_RATE = 3e-4  # of Adam, throughout; choice
+BLEND = 0.05  # of the way from the policy's arm to the taught one, an iteration; choice: at once, it falls
+SETS_OUT, ARRIVES = (
+    2.0,
+    0.5,
+)  # of the task-progress reference, while the arm leaves its default posture; choice
+ARM = slice(NUM_LEG_JOINTS, NUM_JOINTS)
+GRAVITY, JOINT_POS = slice(3, 6), slice(6, 6 + NUM_JOINTS)  # of the observation
+
+
+class Fit:
+    """Supervised updates of rsl-rl's actor."""
+
+    def __init__(self, actor: MLPModel, action_scale: Tensor) -> None:
+        """action_scale (14,) [rad]."""
+        self._actor, self._radians = actor, action_scale
+        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), RATE)
+
+    def update(self, observations: TensorDict, action: Tensor, rate: float, epochs: int) -> float:
+        """Fit the means to actions (M, 14) wanted in M states; the mean of `imitation.fit`'s loss [rad^2]."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        wanted, total, count = self._radians * action, 0.0, 0
+        for _ in range(epochs):
+            for part in torch.randperm(len(wanted), device=wanted.device).split(BATCH):
+                loss = huber_loss(self._radians * self._actor(observations[part]), wanted[part], delta=DELTA)
+                self.optimizer.zero_grad()
+                loss.backward()
+                self.optimizer.step()
+                total, count = total + float(loss.detach()), count + 1
+        return total / count
 
 
 class Teaching:
-    """Fits rsl-rl's actor to a teacher's answers."""
+    """All joints, from a checkpoint."""
 
     def __init__(self, teacher: Checkpoint, actor: MLPModel, action_scale: Tensor) -> None:
         """action_scale (14,) [rad]."""
-        self._teacher, self._actor, self._radians = teacher.actor.to(action_scale.device), actor, action_scale
+        self._teacher, self.fit = teacher.actor.to(action_scale.device), Fit(actor, action_scale)
         self._privileged = teacher.estimator.context_dim > 0
-        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), RATE)
 
     @torch.no_grad()
     def answer(self, observations: TensorDict) -> Tensor:
@@ -41,19 +73,44 @@ class Teaching:
         return self._teacher(seen)
 
     def update(self, observations: TensorDict, way: float) -> dict[str, float]:
-        """Learn from the states of a rollout (T, N), `way` in [0, 1] of the teacher's time being over.
+        """Learn from the states of a rollout (T, N), `way` in [0, 1] of the teacher's time being over."""
+        rate = LEAST_RATE + (RATE - LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * way))
+        flat = observations.flatten(0, 1)
+        return {"teaching": self.fit.update(flat, self.answer(flat), rate, epochs=2)}
 
-        Returns the mean of the loss [rad^2], that of `imitation.fit`.
-        """
-        for group in self.optimizer.param_groups:
-            group["lr"] = LEAST_RATE + (RATE - LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * way))
-        flat, total, count = observations.flatten(0, 1), 0.0, 0
-        wanted = self._radians * self.answer(flat)
-        for _ in range(EPOCHS):
-            for part in torch.randperm(len(wanted), device=wanted.device).split(BATCH):
-                loss = huber_loss(self._radians * self._actor(flat[part]), wanted[part], delta=DELTA)
-                self.optimizer.zero_grad()
-                loss.backward()
-                self.optimizer.step()
-                total, count = total + float(loss.detach()), count + 1
-        return {"teaching": total / count}
+
+class ArmTeaching:
+    """The joints of the arm, from its inverse kinematics; the legs stay with what the policy wants.
+
+    The arm sets out as the task-progress reference falls, and its commands bear its weight.
+    """
+
+    def __init__(self, robot: Robot, actor: MLPModel, action_scale: Tensor) -> None:
+        """action_scale (14,) [rad]."""
+        self._actor, self.fit = actor, Fit(actor, action_scale)
+        self._arm, self._scale = ArmKinematics(robot, action_scale.device), action_scale[ARM]
+        self._default, self._kp = (
+            torch.tensor(x[ARM], dtype=torch.float32, device=action_scale.device)
+            for x in (robot.default_q, robot.kp)
+        )
+
+    @torch.no_grad()
+    def answer(self, observations: TensorDict) -> Tensor:
+        """Actions (M, 6) of the arm on the way to the target in the base frame."""
+        seen = observations["critic"]  # without noise
+        q = self._default + seen[:, JOINT_POS][:, ARM]
+        there = self._arm.solve(q, seen[:, OBSERVATION : OBSERVATION + COMMAND])
+        way = ((SETS_OUT - seen[:, OBSERVATION - 1 : OBSERVATION]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
+        weight = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp
+        return (way * (there - self._default) + weight) / self._scale
+
+    def update(self, observations: TensorDict) -> dict[str, float]:
+        """Learn from the states of a rollout (T, N)."""
+        flat = observations.flatten(0, 1)
+        with torch.no_grad():
+            wanted = self._actor(flat).clone()
+        answer = self.answer(flat)
+        miss = self._scale * (answer - wanted[:, ARM])
+        wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
+        self.fit.update(flat, wanted, ARM_RATE, epochs=1)
+        return {"arm_teaching": float(miss.square().mean().sqrt())}

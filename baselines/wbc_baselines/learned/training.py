@@ -29,7 +29,7 @@ from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.networks import HIDDEN, Actor
 from wbc_baselines.learned.pool import TargetPool, read_pool
 from wbc_baselines.learned.settings import Settings, TrainingError
-from wbc_baselines.learned.teaching import Teaching
+from wbc_baselines.learned.teaching import ArmTeaching, Fit, Teaching
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
@@ -134,7 +134,13 @@ class Trainer:
         self._start = torch.ones(environment.num_envs, dtype=torch.bool, device=self.device)
         self._context = self._estimate() if self._estimates else None
         self.ppo = self._make_ppo(start)
-        self.teaching = self._make_teaching() if settings.teacher else None
+        robot = load_robot(environment.protocol.robot)
+        scale = torch.tensor(robot.action_scale, dtype=torch.float32, device=self.device)
+        self.teaching = self.arm_teaching = None
+        if settings.teacher:
+            self.teaching = Teaching(checkpoint.load_teacher(settings.teacher), self.ppo.actor, scale)
+        if settings.arm_teaching[1]:
+            self.arm_teaching = ArmTeaching(robot, self.ppo.actor, scale)
         parameters = list(self.estimator.parameters())
         self.optimizer = (
             torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
@@ -192,11 +198,6 @@ class Trainer:
         ppo.optimizer.register_step_pre_hook(set_rates)
         return ppo
 
-    def _make_teaching(self) -> Teaching:
-        teacher = checkpoint.load_teacher(self.settings.teacher)
-        scale = load_robot(self.environment.protocol.robot).action_scale
-        return Teaching(teacher, self.ppo.actor, torch.tensor(scale, dtype=torch.float32, device=self.device))
-
     # ---- one iteration -------------------------------------------------------------------------------------
 
     @property
@@ -231,6 +232,9 @@ class Trainer:
         losses = ppo.update()
         if self.teaching and self._taught < 1:
             losses |= self.teaching.update(ppo.storage.observations, self._taught)
+        begin, end = settings.arm_teaching
+        if self.arm_teaching and begin <= self.samples < end:
+            losses |= self.arm_teaching.update(ppo.storage.observations)
         clock.append(time.perf_counter())
         losses |= self._update_estimator(rollout) if rollout else {}
         clock.append(time.perf_counter())
@@ -321,6 +325,9 @@ class Trainer:
         self.estimator.observe(rollout.history)
         return {name: float(value) / settings.estimator_minibatches for name, value in sums.items()}
 
+    def _fits(self) -> list[Fit]:
+        return [teaching.fit for teaching in (self.teaching, self.arm_teaching) if teaching]
+
     # ---- networks for an evaluation, and everything for a resume -------------------------------------------
 
     def actor(self) -> Actor:
@@ -352,7 +359,7 @@ class Trainer:
             "learning_rate": self.ppo.learning_rate,
             "estimator": self.estimator.state_dict() | counts,
             "optimizer": self.optimizer.state_dict() if self.optimizer else {},
-            "teaching": self.teaching.optimizer.state_dict() if self.teaching else {},
+            "teaching": [fit.optimizer.state_dict() for fit in self._fits()],
             "environment": self.environment.save(),
             "history": self._history.window,
             "state": self._state,
@@ -375,8 +382,8 @@ class Trainer:
         )
         if self.optimizer:
             self.optimizer.load_state_dict(saved["optimizer"])
-        if self.teaching:
-            self.teaching.optimizer.load_state_dict(saved["teaching"])
+        for fit, state in zip(self._fits(), saved["teaching"], strict=False):
+            fit.optimizer.load_state_dict(state)
         self.environment.load(saved["environment"])
         self._history.window = saved["history"].to(self.device)
         self._state, self._start = saved["state"].to(self.device), saved["start"].to(self.device)
