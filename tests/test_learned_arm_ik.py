@@ -20,7 +20,7 @@ LOWER, UPPER = (torch.tensor(x[NUM_LEG_JOINTS:], dtype=torch.float32) for x in (
 DEFAULT = torch.tensor(ROBOT.default_q[NUM_LEG_JOINTS:], dtype=torch.float32)
 
 
-def postures(count: int, spread: float = 1.0) -> torch.Tensor:
+def postures(count: int, spread: float = 1.0):
     draw = torch.Generator().manual_seed(0)
     unit = torch.rand(count, 6, generator=draw)
     around = DEFAULT + spread * (LOWER + MARGIN + unit * (UPPER - LOWER - 2 * MARGIN) - DEFAULT)

@@ -14,7 +14,8 @@ from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder  # noqa: E402
 from wbc_baselines.learned.settings import TrainingError  # noqa: E402
-from wbc_baselines.learned.teaching import ARRIVES, BLEND, SETS_OUT  # noqa: E402
+from wbc_baselines.learned.teaching import ARRIVES, BLEND, SETS_OUT, ArmTeaching, Teaching  # noqa: E402
+from wbc_baselines.learned.training import Trainer  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
 STEPS = TINY.envs * TINY.steps  # of an iteration
@@ -22,23 +23,35 @@ REFERENCE = 57  # column of d_ref
 ROBOT = load_robot()
 
 
+def taught(**changes) -> tuple[Trainer, Teaching]:
+    t = trainer(**changes)
+    assert t.teaching
+    return t, t.teaching
+
+
+def arm_taught(**changes) -> tuple[Trainer, ArmTeaching]:
+    t = trainer(**({"arm_teaching": (0.0, 3 * STEPS)} | changes))
+    assert t.arm_teaching
+    return t, t.arm_teaching
+
+
 @pytest.mark.parametrize("method", ["no_latent", "oracle"])
 def test_the_answer_is_the_teachers_own(method, tmp_path):
     path = write(tmp_path, method)
-    t = trainer(teacher=str(path), method="transformer_gru")
+    t, teaching = taught(teacher=str(path), method="transformer_gru")
     seen = t.environment.seen
     parts = [seen.policy] + [seen.critic[:, PRIVILEGED_COLUMNS]] * (method == "oracle")
     wanted = checkpoint.load(path).actor(torch.cat(parts, -1))
-    assert torch.equal(t.teaching.answer(t._observations()), wanted)
+    assert torch.equal(teaching.answer(t._observations()), wanted)
 
 
 def test_the_teacher_drives_fewer_and_fewer_environments(tmp_path, monkeypatch):
-    t = trainer(teacher=str(write(tmp_path, "no_latent")), teacher_steps=4 * STEPS)
+    t, teaching = taught(teacher=str(write(tmp_path, "no_latent")), teacher_steps=4 * STEPS)
     t._log_std.fill_(-20.0)
     done, answers = [], []
-    step, answer = t.environment.step, t.teaching.answer
+    step, answer = t.environment.step, teaching.answer
     monkeypatch.setattr(t.environment, "step", lambda action: done.append(action) or step(action))
-    monkeypatch.setattr(t.teaching, "answer", lambda seen: answers.append(answer(seen)) or answers[-1])
+    monkeypatch.setattr(teaching, "answer", lambda seen: answers.append(answer(seen)) or answers[-1])
     shares = []
     for _ in range(4):
         done.clear()
@@ -97,48 +110,44 @@ def test_a_teacher_has_no_memory(tmp_path):
         trainer(teacher_steps=0)
 
 
-def arm_trainer(**changes):
-    return trainer(**({"arm_teaching": (0.0, 3 * STEPS)} | changes))
-
-
 def test_the_arm_sets_out_as_the_reference_falls_and_bears_its_weight():
-    t = arm_trainer()
+    t, teaching = arm_taught()
     observations = t._observations()
     critic = observations["critic"]
     scale, kp = ROBOT.action_scale[8:], ROBOT.kp[8:]
     q = ROBOT.default_q[8:] + critic[:, 14:20].numpy()
-    weight = t.arm_teaching._arm.holding_torque(torch.tensor(q).float(), critic[:, 3:6]).numpy() / kp
+    weight = teaching._arm.holding_torque(torch.tensor(q).float(), critic[:, 3:6]).numpy() / kp
     critic[:, REFERENCE] = SETS_OUT
-    np.testing.assert_allclose(t.arm_teaching.answer(observations), weight / scale, atol=1e-5)
+    np.testing.assert_allclose(teaching.answer(observations), weight / scale, atol=1e-5)
     critic[:, REFERENCE] = ARRIVES
-    arrived = t.arm_teaching.answer(observations).numpy() * scale - weight
-    there = t.arm_teaching._arm.solve(torch.tensor(q).float(), critic[:, 58:67]).numpy()
+    arrived = teaching.answer(observations).numpy() * scale - weight
+    there = teaching._arm.solve(torch.tensor(q).float(), critic[:, 58:67]).numpy()
     np.testing.assert_allclose(arrived, there - ROBOT.default_q[8:], atol=1e-4)
     critic[:, REFERENCE] = (SETS_OUT + ARRIVES) / 2
-    half = t.arm_teaching.answer(observations).numpy() * scale - weight
+    half = teaching.answer(observations).numpy() * scale - weight
     np.testing.assert_allclose(half, arrived / 2, atol=1e-4)
 
 
 def test_a_lesson_moves_the_arm_a_part_of_the_way_and_leaves_the_legs(monkeypatch):
-    t = arm_trainer()
+    t, teaching = arm_taught()
     t.environment.begin_rollout(0, TINY.steps)
     t._roll_out()
     seen = t.ppo.storage.observations.flatten(0, 1)
-    own, answer = t.ppo.actor(seen).detach(), t.arm_teaching.answer(seen)
+    own, answer = t.ppo.actor(seen).detach(), teaching.answer(seen)
     lessons = []
-    monkeypatch.setattr(t.arm_teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
-    t.arm_teaching.update(t.ppo.storage.observations)
+    monkeypatch.setattr(teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
+    teaching.update(t.ppo.storage.observations)
     torch.testing.assert_close(lessons[0][:, :8], own[:, :8])
     torch.testing.assert_close(lessons[0][:, 8:], own[:, 8:] + BLEND * (answer - own[:, 8:]))
 
 
 def test_the_arm_is_taught_beside_ppo_while_it_is_time():
-    t = arm_trainer(arm_teaching=(STEPS, 3 * STEPS))
+    t, _ = arm_taught(arm_teaching=(STEPS, 3 * STEPS))
     taught = ["loss/arm_teaching" in t.iterate() for _ in range(4)]
     assert taught == [False, True, True, False]
 
 
 def test_the_arm_comes_nearer_to_what_it_is_taught():
-    t = arm_trainer(arm_teaching=(0.0, 1e6), learning_rate=1e-5, least_learning_rate=1e-5)
+    t, _ = arm_taught(arm_teaching=(0.0, 1e6), learning_rate=1e-5, least_learning_rate=1e-5)
     misses = [t.iterate()["loss/arm_teaching"] for _ in range(40)]
     assert np.mean(misses[-5:]) < 0.7 * np.mean(misses[:5])

@@ -61,7 +61,7 @@ class ArmKinematics:
         return torque
 
     def _chain(self, q: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:
-        """Axes and anchors (N, 6, 3) of the joints; rotation (N, 3, 3), shift (N, 3) of each link from zero."""
+        """Axes and anchors (N, 6, 3) of the joints; of each link rotation (N, 3, 3) and shift (N, 3)."""
         rot = torch.eye(3, device=q.device).expand(len(q), 3, 3)
         shift = torch.zeros(len(q), 3, device=q.device)
         axes, anchors, rots, shifts = [], [], [], []
