@@ -25,6 +25,7 @@ from wbc_baselines.learned.imitation import (  # noqa: E402
     fit,
     record,
 )
+from wbc_baselines.learned.inputs import VELOCITY  # noqa: E402
 from wbc_baselines.learned.networks import Actor  # noqa: E402
 from wbc_baselines.learned.symmetry import input_mirror  # noqa: E402
 from wbc_bench.control_loop import ControlLoop  # noqa: E402
@@ -159,9 +160,22 @@ def test_a_method_goes_on_from_a_checkpoint_of_its_own(method, tmp_path):
         assert t.estimator.normalizer.count == t.settings.start_samples
 
 
-def test_a_start_has_no_context_or_the_methods_own(tmp_path):
+@pytest.mark.parametrize("method", ["no_latent", "gru"])
+def test_a_method_begins_with_the_oracle_whose_knowledge_is_at_its_mean(method, tmp_path):
+    start = checkpoint.load(write(tmp_path, "oracle")).actor
+    t = trainer(method=method, start=str(tmp_path / "oracle@0.safetensors"))
+    seen, velocity = torch.randn(5, INPUTS), torch.randn(5, VELOCITY)
+    context = torch.randn(5, t.estimator.context_dim)
+    known = start.normalizer.mean[INPUTS:].expand(5, -1).clone()
+    if method == "gru":
+        context[:, :VELOCITY] = known[:, :VELOCITY] = velocity
+    mine, theirs = t.actor()(torch.cat([seen, context], -1)), start(torch.cat([seen, known], -1))
+    torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-5)
+
+
+def test_a_start_has_no_context_or_a_known_one(tmp_path):
     path = write(tmp_path, "cenet")
-    with pytest.raises(CheckpointError, match="is of cenet, valid: a method without a context, or with"):
+    with pytest.raises(CheckpointError, match="is of cenet, valid: a method without a context, the oracle"):
         checkpoint.load_start(str(path), "gru")
 
 
@@ -169,7 +183,7 @@ def test_the_normaliser_of_a_start_counts():
     start = constant(0.0)
     start.normalizer.mean.fill_(2.0)
     t = trainer()
-    begin_with(t.ppo.actor, start, samples=1000)
+    begin_with(t.ppo.actor, start, context=0, samples=1000)
     t.ppo.actor.train().update_normalization(TensorDict({"policy": torch.zeros(1000, INPUTS)}, [1000]))
     assert torch.allclose(t.actor().normalizer.mean, torch.ones(INPUTS))
 

@@ -14,7 +14,7 @@ from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder  # noqa: E402
 from wbc_baselines.learned.settings import TrainingError  # noqa: E402
-from wbc_baselines.learned.teaching import ARRIVES, BLEND, SETS_OUT, ArmTeaching, Teaching  # noqa: E402
+from wbc_baselines.learned.teaching import ARM_SHARE, ARRIVES, BLEND, SETS_OUT, ArmTeaching, Teaching  # noqa: E402
 from wbc_baselines.learned.training import Trainer  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
@@ -136,9 +136,12 @@ def test_a_lesson_moves_the_arm_a_part_of_the_way_and_leaves_the_legs(monkeypatc
     own, answer = t.ppo.actor(seen).detach(), teaching.answer(seen)
     lessons = []
     monkeypatch.setattr(teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
+    monkeypatch.setattr(torch, "randperm", lambda n, device: torch.arange(n))
     teaching.update(t.ppo.storage.observations)
-    torch.testing.assert_close(lessons[0][:, :8], own[:, :8])
-    torch.testing.assert_close(lessons[0][:, 8:], own[:, 8:] + BLEND * (answer - own[:, 8:]))
+    count = int(ARM_SHARE * len(seen))
+    torch.testing.assert_close(lessons[0][:, :8], own[:count, :8])
+    wanted = own[:, 8:] + BLEND * (answer - own[:, 8:])
+    torch.testing.assert_close(lessons[0][:, 8:], wanted[:count])
 
 
 def test_the_arm_is_taught_beside_ppo_while_it_is_time():

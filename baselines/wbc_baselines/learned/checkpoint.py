@@ -220,18 +220,25 @@ def identity(name: str) -> str:
 
 
 def load_start(name: str, estimator: str) -> Checkpoint:
-    """A checkpoint that a method with this estimator can begin with: without context, or with the same.
+    """A checkpoint that a method with this estimator can begin with; see `shared_context`.
 
-    Raises: CheckpointError, it has another; and see `load`.
+    Raises: CheckpointError, its estimator is a third one; and see `load`.
     """
     found = load(find(name))
     theirs = METHODS[found.card.method].estimator
-    if theirs not in ("none", estimator):
+    if theirs not in ("none", "oracle", estimator):
         raise CheckpointError(
-            f"--start '{name}' is of {found.card.method}, valid: a method without a context, or with "
-            f"the estimator '{estimator}'"
+            f"--start '{name}' is of {found.card.method}, valid: a method without a context, the oracle, "
+            f"or a method with the estimator '{estimator}'"
         )
     return found
+
+
+def shared_context(start: Estimator, mine: Estimator) -> int:
+    """First columns of the context that mean the same in two policies: all, or the velocity, or none."""
+    if type(start) is type(mine):
+        return mine.context_dim
+    return inputs.VELOCITY if start.context_dim and mine.trainable else 0
 
 
 def load_teacher(name: str) -> Checkpoint:

@@ -49,8 +49,8 @@ class Settings:
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
     start: str = "ik_student"
-    """Checkpoint that the policy begins with: one without context (`wbc-train imitate`), or one with the same
-    estimator, which begins with it as well; "" for random weights."""
+    """Checkpoint that the policy begins with: one without context (`wbc-train imitate`), the oracle, or one
+    with the same estimator, which begins with it as well; "" for random weights."""
     start_samples: int = 30_000_000
     """Observations that the start's normaliser counts for. With fewer, first falls shift it faster than the
     policy can follow: at 200,000 a start that stood for 2.9 s fell at 1.2 s half a million steps later,

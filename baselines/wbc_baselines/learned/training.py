@@ -121,7 +121,7 @@ class Trainer:
         start = None
         if settings.start:
             start = checkpoint.load_start(settings.start, self.method.estimator)
-            if start.estimator.context_dim:  # the same estimator: no weights in common otherwise
+            if type(start.estimator) is type(self.estimator):
                 self.estimator.load_state_dict(start.estimator.state_dict())
                 for name, count in self.estimator.named_buffers():
                     if name.endswith("normalizer.count"):
@@ -162,7 +162,8 @@ class Trainer:
         self._log_std.requires_grad_(False)  # follows a schedule, see `iterate`
         if start:
             with torch.no_grad():
-                begin_with(actor, start.actor, settings.start_samples)
+                shared = checkpoint.shared_context(start.estimator, self.estimator)
+                begin_with(actor, start.actor, shared, settings.start_samples)
         storage = RolloutStorage("rl", settings.envs, settings.steps, seen, [ACTIONS], str(self.device))
         ppo = PPO(
             actor,
