@@ -24,9 +24,10 @@ from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 BATCH = 1024  # lessons an update; choice, as that of `imitation.fit`
 EPOCHS = 4  # over the lessons of a rollout; choice
 RATE, LEAST_RATE = 1e-3, 5e-5  # of Adam, first and last; choice
-ARM_RATE = 3e-4  # of Adam, throughout; choice
+ARM_RATE = 5e-5  # of Adam, throughout; choice: at 3e-4 the arm is out before the legs can carry it
 ARM_SHARE = 0.25  # of a rollout's states; choice: the inverse kinematics of all takes as long as PPO
-BLEND = 0.05  # of the way from the policy's arm to the taught one, an iteration; choice: at once, it falls
+BLEND = 0.05  # of the way from the policy's arm to the taught one, an iteration; choice
+REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
 SETS_OUT, ARRIVES = (
     2.0,
     0.5,
@@ -97,22 +98,26 @@ class ArmTeaching:
         )
 
     @torch.no_grad()
-    def answer(self, observations: TensorDict) -> Tensor:
-        """Actions (M, 6) of the arm on the way to the target in the base frame."""
+    def answer(self, observations: TensorDict) -> tuple[Tensor, Tensor]:
+        """Actions (M, 6) of the arm on the way to the target in the base frame; whether (M,) it gets there."""
         seen = observations["critic"]  # without noise
-        q = self._default + seen[:, JOINT_POS][:, ARM]
-        there = self._arm.solve(q, seen[:, OBSERVATION : OBSERVATION + COMMAND])
+        q, command = self._default + seen[:, JOINT_POS][:, ARM], seen[:, OBSERVATION:][:, :COMMAND]
+        there = self._arm.solve(q, command)
+        miss = torch.linalg.vector_norm(self._arm.hand(there)[0] - command[:, :3], dim=-1)
         way = ((SETS_OUT - seen[:, OBSERVATION - 1 : OBSERVATION]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
         weight = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp
-        return (way * (there - self._default) + weight) / self._scale
+        return (way * (there - self._default) + weight) / self._scale, miss < REACHED
 
     def update(self, observations: TensorDict) -> dict[str, float]:
         """Learn from some of the states of a rollout (T, N); the root mean square miss [rad] before."""
         flat = observations.flatten(0, 1)
         flat = flat[torch.randperm(len(flat), device=flat.device)[: int(ARM_SHARE * len(flat))]]
+        answer, reached = self.answer(flat)
+        if not reached.any():
+            return {}
+        flat, answer = flat[reached], answer[reached]
         with torch.no_grad():
             wanted = self._actor(flat).clone()
-        answer = self.answer(flat)
         miss = self._scale * (answer - wanted[:, ARM])
         wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
         self.fit.update(flat, wanted, ARM_RATE, epochs=1)
