@@ -99,7 +99,7 @@ class ArmTeaching:
 
     @torch.no_grad()
     def answer(self, observations: TensorDict) -> tuple[Tensor, Tensor]:
-        """Actions (M, 6) of the arm on the way to the target in the base frame; whether (M,) it gets there."""
+        """Actions (M, 6) of the arm on the way to the target, and whether (M,) it gets there."""
         seen = observations["critic"]  # without noise
         q, command = self._default + seen[:, JOINT_POS][:, ARM], seen[:, OBSERVATION:][:, :COMMAND]
         there = self._arm.solve(q, command)
