@@ -10,7 +10,6 @@ from learned import write  # noqa: E402
 from test_learned_training import TINY, assert_equal, trainer  # noqa: E402
 
 from wbc_baselines.learned import checkpoint, runs  # noqa: E402
-from wbc_baselines.learned import teaching as teaching_module  # noqa: E402
 from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder  # noqa: E402
@@ -139,12 +138,9 @@ def test_a_lesson_moves_the_arm_a_part_of_the_way_where_it_reaches_and_leaves_th
     assert not reached[: TINY.envs].any() and reached.any()
     lessons = []
     monkeypatch.setattr(teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
-    monkeypatch.setattr(torch, "randperm", lambda n, device: torch.arange(n))
-    monkeypatch.setattr(teaching_module, "ARM_SHARE", 0.75)
     teaching.update(t.ppo.storage.observations)
-    used = reached & (torch.arange(len(seen)) < 0.75 * len(seen))
-    torch.testing.assert_close(lessons[0][:, :8], own[used, :8])
-    torch.testing.assert_close(lessons[0][:, 8:], (own[:, 8:] + BLEND * (answer - own[:, 8:]))[used])
+    torch.testing.assert_close(lessons[0][:, :8], own[reached, :8])
+    torch.testing.assert_close(lessons[0][:, 8:], (own[:, 8:] + BLEND * (answer - own[:, 8:]))[reached])
     t.ppo.storage.observations["critic"][..., 58] = 3.0
     assert teaching.update(t.ppo.storage.observations) == {} and len(lessons) == 1
 

@@ -49,6 +49,7 @@ TINY = Settings(
     learning_rate=3e-4,
     least_learning_rate=1e-4,
     start="",
+    teacher="",
     critic_iterations=0,
     calm=(0.0, 0.0),
 )

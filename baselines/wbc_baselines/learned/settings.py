@@ -32,13 +32,13 @@ class Settings:
     """Passes of PPO over a rollout."""
     minibatches: int = 4
     """Parts of a rollout in one pass."""
-    learning_rate: float = 3e-5
+    learning_rate: float = 7e-5
     """Of the policy at the start; then adapted to `desired_kl`."""
-    least_learning_rate: float = 1e-5
+    least_learning_rate: float = 3e-5
     """Below which it is not adapted."""
     critic_learning_rate: float = 5e-4
     """Of the critic, throughout."""
-    desired_kl: float = 0.01
+    desired_kl: float = 0.02
     """KL divergence of an update that the learning rate aims at."""
     gamma: float = 0.99
     """Discount of a control step."""
@@ -48,27 +48,27 @@ class Settings:
     """PPO's clip."""
     gradient_norm: float = 1.0
     """Largest norm of a gradient."""
-    start: str = "ik_student"
+    start: str = "oracle@0"
     """Checkpoint that the policy begins with: one without context (`wbc-train imitate`), the oracle, or one
     with the same estimator, which begins with it as well; "" for random weights."""
     start_samples: int = 30_000_000
     """Observations that the start's normaliser counts for. With fewer, first falls shift it faster than the
     policy can follow: at 200,000 a start that stood for 2.9 s fell at 1.2 s half a million steps later,
     before any update of the policy."""
-    teacher: str = ""
+    teacher: str = "oracle@0"
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 3e6
+    teacher_steps: float = 1.5e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
     arm_teaching: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: tuple[float, float] = (0.1, 0.08)
+    std_legs: tuple[float, float] = (0.2, 0.12)
     """Standard deviation of the leg actions at the start and in the end."""
-    std_arm: tuple[float, float] = (0.2, 0.1)
+    std_arm: tuple[float, float] = (0.3, 0.15)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: float = 12e6
+    std_steps: float = 30e6
     """Control steps over which they fall, exponentially."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
@@ -76,9 +76,9 @@ class Settings:
     """Physics steps in a control period."""
     curriculum: float = 0.0
     """Control steps over which the strata ramp from mostly `arm` to the protocol's weights."""
-    calm: tuple[float, float] = (1e6, 12e6)
+    calm: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when noise, pushes and randomisation rise from none to the
-    protocol's; before, there are none."""
+    protocol's; 0 0 for all from the first step on: who learns to stand undisturbed does not learn to step."""
     estimator_share: float = 0.125
     """Part of the environments whose rollouts train the estimator; drawn anew each iteration."""
     estimator_minibatches: int = 4

@@ -23,15 +23,11 @@ from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 
 BATCH = 1024  # lessons an update; choice, as that of `imitation.fit`
 EPOCHS = 4  # over the lessons of a rollout; choice
-RATE, LEAST_RATE = 1e-3, 5e-5  # of Adam, first and last; choice
-ARM_RATE = 5e-5  # of Adam, throughout; choice: at 3e-4 the arm is out before the legs can carry it
-ARM_SHARE = 0.25  # of a rollout's states; choice: the inverse kinematics of all takes as long as PPO
-BLEND = 0.05  # of the way from the policy's arm to the taught one, an iteration; choice
+RATE, LEAST_RATE = 5e-4, 2e-5  # of Adam, first and last; choice
+ARM_RATE = 3e-4  # of Adam, throughout; choice
+BLEND = 0.3  # of the way from the policy's arm to the taught one, an iteration; choice
 REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
-SETS_OUT, ARRIVES = (
-    2.0,
-    0.5,
-)  # of the task-progress reference, while the arm leaves its default posture; choice
+SETS_OUT, ARRIVES = 2.0, 0.5  # of the task-progress reference, while the arm leaves its default; choice
 ARM = slice(NUM_LEG_JOINTS, NUM_JOINTS)
 GRAVITY, JOINT_POS = slice(3, 6), slice(6, 6 + NUM_JOINTS)  # of the observation
 
@@ -109,9 +105,8 @@ class ArmTeaching:
         return (way * (there - self._default) + weight) / self._scale, miss < REACHED
 
     def update(self, observations: TensorDict) -> dict[str, float]:
-        """Learn from some of the states of a rollout (T, N); the root mean square miss [rad] before."""
+        """Learn from the states of a rollout (T, N); the root mean square miss [rad] before."""
         flat = observations.flatten(0, 1)
-        flat = flat[torch.randperm(len(flat), device=flat.device)[: int(ARM_SHARE * len(flat))]]
         answer, reached = self.answer(flat)
         if not reached.any():
             return {}
