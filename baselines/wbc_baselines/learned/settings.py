@@ -57,16 +57,16 @@ class Settings:
     before any update of the policy."""
     teacher: str = "oracle@0"
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 1.5e6
+    teacher_steps: float = 1.9e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
     arm_teaching: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: tuple[float, float] = (0.2, 0.12)
+    std_legs: tuple[float, float] = (0.1, 0.1)
     """Standard deviation of the leg actions at the start and in the end."""
-    std_arm: tuple[float, float] = (0.3, 0.15)
+    std_arm: tuple[float, float] = (0.1, 0.1)
     """Standard deviation of the arm actions at the start and in the end."""
     std_steps: float = 30e6
     """Control steps over which they fall, exponentially."""
