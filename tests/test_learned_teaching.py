@@ -108,6 +108,8 @@ def test_a_teacher_has_no_memory(tmp_path):
         checkpoint.load_teacher(str(write(tmp_path, "gru")))
     with pytest.raises(TrainingError, match="--teacher-steps 0: valid: more than 0"):
         trainer(teacher_steps=0)
+    with pytest.raises(TrainingError, match="--arm-teaching 2 1: valid: 0 <= begin <= end"):
+        trainer(arm_teaching=(2.0, 1.0))
 
 
 def test_the_arm_sets_out_as_the_reference_falls_and_bears_its_weight():

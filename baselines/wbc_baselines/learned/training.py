@@ -383,7 +383,7 @@ class Trainer:
         )
         if self.optimizer:
             self.optimizer.load_state_dict(saved["optimizer"])
-        for fit, state in zip(self._fits(), saved["teaching"], strict=False):
+        for fit, state in zip(self._fits(), saved["teaching"], strict=True):
             fit.optimizer.load_state_dict(state)
         self.environment.load(saved["environment"])
         self._history.window = saved["history"].to(self.device)
