@@ -147,7 +147,9 @@ class Settings:
             raise TrainingError(f"--calm {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for never")
         begin, end = self.arm_teaching
         if not 0.0 <= begin <= end:
-            raise TrainingError(f"--arm-teaching {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never")
+            raise TrainingError(
+                f"--arm-teaching {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
+            )
         if self.envs * self.steps < self.minibatches:
             raise TrainingError(
                 f"--minibatches {self.minibatches}: valid: 1 to {self.envs * self.steps} (envs x steps)"
