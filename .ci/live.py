@@ -2,7 +2,8 @@
 
 Another processor rounds differently, and a robot on the verge of falling amplifies that; so not the bytes are
 compared but, over episodes spread evenly over all replicates:
-  - at least 90 % of the outcomes are equal;
+  - at least 85 % of the outcomes are equal, a fall and an illegal contact counting alike (weights changed by a
+    millionth change up to 5 % of a learned policy's, and 10 % if those two are told apart);
   - where they are equal and the robot stood, the median change of the position error is below 5 mm.
 """
 
@@ -14,13 +15,14 @@ import pandas as pd
 from joblib import Parallel, delayed
 
 from wbc_bench.analysis import collect, stood
+from wbc_bench.controller import spec_of_replicate
 from wbc_bench.execution import evaluate_shard
 from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.protocol import find_protocol
 from wbc_bench.store import ResultStore
 
 EPISODES = 60
-EQUAL_OUTCOMES = 0.90
+EQUAL_OUTCOMES = 0.85
 POSITION_CHANGE = 0.005  # [m]
 
 
@@ -45,16 +47,23 @@ def main() -> int:
             chosen = method.episodes.iloc[every].reset_index(drop=True)
             keys = zip(chosen["replicate"], chosen["episode"], strict=True)
             rows = manifest.take(np.array([row_of[key] for key in keys]))
-            labels.append((name, spec, chosen))
-            work.append(delayed(evaluate_shard)(spec, protocol, rows))
+            for replicate, part in chosen.groupby("replicate"):  # a learned method has a seed for each
+                own = spec_of_replicate(spec, int(replicate))
+                labels.append((name, spec, part))
+                work.append(delayed(evaluate_shard)(own, protocol, rows.take(part.index.to_numpy())))
+    pairs: dict[tuple[str, str], list[tuple[pd.DataFrame, pd.DataFrame]]] = {}
     for (name, spec, before), table in zip(labels, Parallel(os.cpu_count())(work), strict=True):
-        failures += not compare(name, spec, before, table.to_pandas())
+        pairs.setdefault((name, spec), []).append((before, table.to_pandas()))
+    for (name, spec), parts in pairs.items():
+        before, after = (pd.concat(tables, ignore_index=True) for tables in zip(*parts, strict=True))
+        failures += not compare(name, spec, before, after)
     return 1 if failures else 0
 
 
 def compare(name: str, spec: str, before: pd.DataFrame, after: pd.DataFrame) -> bool:
     """Print and judge one controller."""
-    equal = before["outcome"] == after["outcome"]
+    fell = {"illegal_contact": "fell"}
+    equal = before["outcome"].replace(fell) == after["outcome"].replace(fell)
     change = (before["position_error"] - after["position_error"]).abs()[equal & stood(before)]
     median = float(change.median()) if len(change) else 0.0  # [m] nobody stood: nothing to compare
     ok = equal.mean() >= EQUAL_OUTCOMES and median < POSITION_CHANGE

@@ -51,8 +51,12 @@ summary { cursor: pointer; font-weight: 600; margin: 0 0 6px; }
 
 
 # What is not made of records, stands beside the report and is shown in it or linked from it.
-GIVEN = ("figures/strip_*", "figures/latent_*", "replays/**/*")
-GIVEN_SECTIONS = (("strip_", "Successive frames"), ("latent_", "Latent spaces"))
+GIVEN = ("figures/strip_*", "figures/latent_*", "figures/learning_curves*", "replays/**/*")
+GIVEN_SECTIONS = (
+    ("strip_", "Successive frames"),
+    ("latent_", "Latent spaces"),
+    ("learning_curves", "Learning curves"),
+)
 CAPTIONS = {  # end of a figure's name -> what it shows
     "_success": "Success by stratum of the targets.",
     "_outcomes": "How the episodes ended.",
