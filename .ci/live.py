@@ -2,8 +2,8 @@
 
 Another processor rounds differently, and a robot on the verge of falling amplifies that; so not the bytes are
 compared but, over episodes spread evenly over all replicates:
-  - at least 85 % of the outcomes are equal, a fall and an illegal contact counting alike (weights changed by a
-    millionth change up to 5 % of a learned policy's, and 10 % if those two are told apart);
+  - at least 85 % of the outcomes are equal, a fall and an illegal contact counting alike (weights changed by
+    a millionth change up to 5 % of a learned policy's, and 10 % if those two are told apart);
   - where they are equal and the robot stood, the median change of the position error is below 5 mm.
 """
 
