@@ -143,7 +143,7 @@ def test_no_traceback_and_exit_code_in_a_real_process(tmp_path):
 
 def test_interrupted_says_that_it_resumes(tmp_path):
     tiny = write_tiny(tmp_path, episodes=120)
-    spec = write_controller(tmp_path, "pausing", "time.sleep(0.02)")
+    spec = write_controller(tmp_path, "pausing", "time.sleep(0.1)")
     command = [sys.executable, "-m", "wbc_bench", "eval", "--controller", spec, "--protocol", str(tiny)]
     command += ["--out", str(tmp_path), "--workers", "2"]
     process = subprocess.Popen(
