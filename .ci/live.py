@@ -2,7 +2,7 @@
 
 Another processor rounds differently, and a robot on the verge of falling amplifies that; so not the bytes are
 compared but, over episodes spread evenly over all replicates:
-  - at least 85 % of the outcomes are equal, a fall and an illegal contact counting alike (weights changed by
+  - at least 90 % of the outcomes are equal, a fall and an illegal contact counting alike (weights changed by
     a millionth change up to 5 % of a learned policy's, and 10 % if those two are told apart);
   - where they are equal and the robot stood, the median change of the position error is below 5 mm.
 """
@@ -22,7 +22,7 @@ from wbc_bench.protocol import find_protocol
 from wbc_bench.store import ResultStore
 
 EPISODES = 60
-EQUAL_OUTCOMES = 0.85
+EQUAL_OUTCOMES = 0.90
 POSITION_CHANGE = 0.005  # [m]
 
 

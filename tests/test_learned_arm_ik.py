@@ -27,13 +27,19 @@ def postures(count: int, spread: float = 1.0):
     return around.clamp(LOWER + MARGIN, UPPER - MARGIN)
 
 
-def test_the_hand_is_mujocos():
+def posed(q) -> mujoco.MjData:
+    """MuJoCo's robot at rest, its base turned, its arm at joints q (6,)."""
     model = ROBOT.model()
     data = mujoco.MjData(model)
+    data.qpos[:7] = [0.3, -0.2, 0.9, *np.array([0.8, 0.1, -0.5, 0.3]) / np.sqrt(0.99)]
+    data.qpos[-6:] = q
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_the_hand_is_mujocos():
     for q in postures(20):
-        data.qpos[:] = [0.3, -0.2, 0.9, *np.array([0.8, 0.1, -0.5, 0.3]) / np.sqrt(0.99), *np.zeros(14)]
-        data.qpos[-6:] = q
-        mujoco.mj_kinematics(model, data)
+        data = posed(q)
         base = data.xmat[1].reshape(3, 3)
         site = data.site("tcp")
         pos, rot, _ = ARM.hand(q[None])
@@ -53,12 +59,8 @@ def test_jacobian_by_finite_differences():
 
 
 def test_holding_torque_is_mujocos_bias_at_rest():
-    model = ROBOT.model()
-    data = mujoco.MjData(model)
     for q in postures(20):
-        data.qpos[:] = [0.3, -0.2, 0.9, *np.array([0.8, 0.1, -0.5, 0.3]) / np.sqrt(0.99), *np.zeros(14)]
-        data.qpos[-6:] = q
-        mujoco.mj_forward(model, data)
+        data = posed(q)
         down = torch.tensor(-data.xmat[1].reshape(3, 3)[2], dtype=torch.float32)
         torque = ARM.holding_torque(q[None], down[None])
         np.testing.assert_allclose(torque[0], data.qfrc_bias[-6:], atol=1e-3)

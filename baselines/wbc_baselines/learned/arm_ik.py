@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wbc_baselines.learned.reference import rotation_from_rho6
+from wbc_baselines.learned.reference import rotation_from_rho6, twice_sine
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
 ROTATION_WEIGHT = 0.3  # [m/rad] of orientation against position; choice
@@ -116,9 +116,8 @@ def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
 
 def rotation_vector(rot: Tensor) -> Tensor:
     """Rotation vectors (N, 3) [rad] of rotations (N, 3, 3); near a half turn their direction is vague."""
-    skew = rot - rot.transpose(1, 2)
-    twice_sine = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
-    length = torch.linalg.vector_norm(twice_sine, dim=-1)
+    axis = twice_sine(rot)
+    length = torch.linalg.vector_norm(axis, dim=-1)
     cosine = (rot.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     angle = torch.atan2(length / 2, cosine)
-    return twice_sine * (angle / length.clamp(min=1e-6))[:, None]
+    return axis * (angle / length.clamp(min=1e-6))[:, None]

@@ -10,7 +10,7 @@ from wbc_baselines.learned import inputs
 from wbc_baselines.learned.backends.base import Backend, State
 from wbc_baselines.learned.methods import Reward
 from wbc_baselines.learned.pool import TargetPool
-from wbc_baselines.learned.reference import advance, initial_reference, pose_errors
+from wbc_baselines.learned.reference import advance, initial_reference, pose_errors, twice_sine
 from wbc_baselines.learned.rewards import Body, Signals, rewards
 from wbc_baselines.learned.starts import Draws, draw_starts, weakened
 from wbc_bench.episodes import STRATA
@@ -233,9 +233,8 @@ class Environment:
         rot_w = rotation_from_wxyz(state.qpos[:, 3:7])
         base_w = state.qpos[:, :3]
         turned = state.ee_rot_w @ before.ee_rot_w.transpose(1, 2)
-        skew = turned - turned.transpose(1, 2)
         # sine of the angle turned in a period for the angle: 0.1 % off at 4 rad/s
-        ee_ang_vel_w = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1) * (0.5 * rate)
+        ee_ang_vel_w = twice_sine(turned) * (0.5 * rate)
         world = torch.cat(
             [
                 torch.stack(

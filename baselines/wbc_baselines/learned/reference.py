@@ -33,6 +33,12 @@ def rotation_from_rho6(rho6: Tensor) -> Tensor:
     return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
 
 
+def twice_sine(rot: Tensor) -> Tensor:
+    """Axes (N, 3) of rotations (N, 3, 3), twice as long as the sine of the angle."""
+    skew = rot - rot.transpose(1, 2)
+    return torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+
+
 def pose_errors(pos: Tensor, rot: Tensor, target_pos: Tensor, target_rot: Tensor) -> tuple[Tensor, Tensor]:
     """Position error (N,) [m] and geodesic angle (N,) [rad] of poses in one frame.
 
