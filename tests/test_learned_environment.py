@@ -62,7 +62,7 @@ def manifest_of(start: Start, target: np.ndarray) -> EpisodeManifest:
     """A manifest of the same episodes as a training start's."""
     count = len(start.friction)
     columns: dict[str, Any] = {field.name: np.zeros(count) for field in fields(EpisodeManifest)}
-    columns |= start._asdict()
+    columns |= {name: column.numpy() for name, column in start._asdict().items()}
     columns |= {
         "target_pos_w": POOL.pos_w[target].astype(float),
         "target_quat_w": POOL.quat_w[target].astype(float),
@@ -78,7 +78,7 @@ def test_the_physics_is_the_evaluations():
     draws = draw_starts(PROTOCOL, POOL, N, stream(3, "test"))
     backend = CpuBackend(PROTOCOL, N, 1)
     simulation = Simulation(PROTOCOL, manifest_of(draws.start, draws.target))
-    state = backend.reset(np.arange(N), draws.start)
+    state = backend.reset(torch.arange(N), draws.start)
     robot = load_robot(PROTOCOL.robot)
     for action in actions(15):
         command = torch.tensor(robot.command_of(action.double().numpy()), dtype=torch.float32)
@@ -185,7 +185,7 @@ def test_starts_have_the_manifests_distribution():
     ):
         assert low <= values.min() < low + 0.02 * (high - low)
         assert high >= values.max() > high - 0.02 * (high - low)
-    heights = [randomization.resting_height(PROTOCOL.robot, q) for q in start.leg_q[:5]]
+    heights = [randomization.resting_height(PROTOCOL.robot, q) for q in start.leg_q[:5].numpy()]
     np.testing.assert_array_equal(start.base_height[:5], heights)
     counts = np.bincount(POOL.stratum[draws.target], minlength=3)
     assert np.all(np.abs(counts - count / 3) < 5 * np.sqrt(count * 2 / 9))
@@ -268,6 +268,23 @@ def test_reset_touches_only_what_has_ended():
     for a, b in zip(second[0].seen, second[1].seen, strict=True):
         torch.testing.assert_close(a[others], b[others], rtol=0, atol=0)
         assert not torch.equal(a[1], b[1])
+
+
+def test_episodes_are_drawn_ahead_and_taken_in_order():
+    """Each is taken once; what is left of a bank that is too small is dropped."""
+    env = environment()
+    first = env._episodes.target_pos_w.clone()
+    assert torch.equal(env._episode.target_pos_w, first)  # all of the first went into the start
+    start, episode = env._take(4)
+    assert torch.equal(episode.target_pos_w, env._episodes.target_pos_w[:4]) and len(start.friction) == 4
+    second = env._episodes.target_pos_w.clone()
+    assert not torch.equal(second, first)
+    assert torch.equal(env._take(1)[1].target_pos_w, second[4:5])
+    third = env._take(2)[1].target_pos_w
+    assert torch.equal(third, env._episodes.target_pos_w[:2]) and not torch.equal(third, second[:2])
+    same = environment()
+    same.load(env.save())
+    assert torch.equal(same._take(3)[1].target_pos_w, env._take(3)[1].target_pos_w)
 
 
 def test_endings():

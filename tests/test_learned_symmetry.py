@@ -11,7 +11,7 @@ from test_learned_environment import coarse  # noqa: E402
 from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.environment import Environment  # noqa: E402
 from wbc_baselines.learned.pool import TargetPool  # noqa: E402
-from wbc_baselines.learned.symmetry import input_mirror, joint_mirror  # noqa: E402
+from wbc_baselines.learned.symmetry import critic_mirror, input_mirror, joint_mirror  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
 ROBOT = load_robot()
@@ -50,8 +50,12 @@ def test_mirrored_actions_lead_to_mirrored_observations():
     """Up to the hand's 0.1 mm, and half a millimetre of the centre of mass, that lie beside the plane."""
     left, right = one_target(1.0), one_target(-1.0)
     image, turn = input_mirror(ROBOT), joint_mirror(ROBOT)
+    whole = critic_mirror(ROBOT)
     tolerance = np.full(67, 0.03)
     tolerance[20:34] = 0.4  # [rad/s] joint velocities, up to 6
+    wide = np.concatenate([tolerance, np.full(80, 0.05)])
+    wide[70:84], wide[84:98] = 1.0, 40.0  # [N m] up to 90, [rad/s^2] up to 300
+    wide[102:105], wide[-6:] = 0.6, 2.0  # [rad/s] of the hand, [N] up to 80
     rng = np.random.default_rng(1)
     for env in (left, right):
         env.begin_rollout(0, 10)
@@ -59,6 +63,8 @@ def test_mirrored_actions_lead_to_mirrored_observations():
     for _ in range(10):
         seen, other = left.seen.policy.numpy(), right.seen.policy.numpy()
         assert (np.abs(other - image(seen)) < tolerance).all()
+        true, truth = left.seen.critic.numpy(), right.seen.critic.numpy()
+        assert (np.abs(truth - whole(true)) < wide).all()
         differ |= bool((np.abs(other - seen) > 10 * tolerance).any())
         action = rng.normal(0.0, 0.3, (2, 14)).astype(np.float32)
         left.step(torch.from_numpy(action))
@@ -67,7 +73,7 @@ def test_mirrored_actions_lead_to_mirrored_observations():
 
 
 def test_a_mirror_image_of_a_mirror_image_is_the_thing_itself():
-    for mirror, size in ((input_mirror(ROBOT), 67), (joint_mirror(ROBOT), 14)):
+    for mirror, size in ((critic_mirror(ROBOT), 147), (input_mirror(ROBOT), 67), (joint_mirror(ROBOT), 14)):
         x = np.random.default_rng(2).normal(size=(3, size)).astype(np.float32)
         np.testing.assert_array_equal(mirror(mirror(x)), x)
         assert not np.array_equal(mirror(x), x)

@@ -103,6 +103,34 @@ def test_equal_seeds_are_equal_and_others_are_not():
     assert not torch.equal(one.actor().mlp[0].weight, other.actor().mlp[0].weight)
 
 
+@pytest.mark.parametrize("method", ["no_latent", "oracle"])
+def test_mirror_images_double_every_minibatch(method):
+    """The images of images are the samples, and PPO sees both."""
+    t = trainer(method=method, mirror=True)
+    assert t.ppo.symmetry
+    augment, seen = t.ppo.symmetry.data_augmentation_func, t._observations()
+    action = torch.randn(len(seen), 14)
+    both, actions = augment(None, seen, action)
+    again, back = augment(None, both[len(seen) :], actions[len(seen) :])
+    for name in seen.keys():  # noqa: SIM118
+        assert torch.equal(again[name][len(seen) :], seen[name])
+        assert not torch.equal(both[name][len(seen) :], seen[name])
+    assert torch.equal(back[len(seen) :], action) and not torch.equal(actions[len(seen) :], action)
+    sizes = []
+    forward = t.ppo.critic.forward
+    t.ppo.critic.forward = lambda obs, **more: sizes.append(len(obs)) or forward(obs, **more)
+    found = t.iterate()
+    assert all(np.isfinite(value) for name, value in found.items() if name.startswith("loss/"))
+    assert sizes[-1] == 2 * TINY.envs * TINY.steps // TINY.minibatches
+
+
+def test_a_mirror_needs_inputs_that_have_one():
+    with pytest.raises(
+        TrainingError, match="--mirror with --method transformer_gru: valid: no_latent, oracle"
+    ):
+        replace(TINY, method="transformer_gru", mirror=True).check()
+
+
 def test_the_policys_gradient_never_reaches_the_estimator():
     """PPO's update leaves the estimator without gradient, weights as they were; and the other way round."""
     t = trainer(method="transformer_gru")

@@ -6,6 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mujoco_warp")
 
+from wbc_baselines.learned.backends.base import Start  # noqa: E402
 from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.backends.warp import WarpBackend  # noqa: E402
 from wbc_baselines.learned.pool import read_pool  # noqa: E402
@@ -23,7 +24,10 @@ def test_the_back_ends_agree_over_a_third_of_a_second():
     start = draws.start._replace(leg_q=0.2 * draws.start.leg_q)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     cpu, warp = CpuBackend(PROTOCOL, 2, 1), WarpBackend(PROTOCOL, 2, device)
-    first = [backend.reset(np.arange(2), start) for backend in (cpu, warp)]
+    first = [
+        b.reset(torch.arange(2, device=b.device), Start(*(column.to(b.device) for column in start)))
+        for b in (cpu, warp)
+    ]
     np.testing.assert_allclose(first[0].torque, first[1].torque.cpu(), atol=1e-4)
     robot = load_robot(PROTOCOL.robot)
     default, scale = (torch.tensor(a, dtype=torch.float32) for a in (robot.default_q, robot.action_scale))

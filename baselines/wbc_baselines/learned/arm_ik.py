@@ -35,6 +35,8 @@ class ArmKinematics:
             return torch.tensor(array, dtype=torch.float32, device=device)
 
         self._anchor, self._axis = tensor(data.xanchor[first:]), tensor(data.xaxis[first:])
+        self._cross = torch.stack([cross_matrix(axis) for axis in self._axis])
+        self._one = torch.eye(3, device=device)
         self._pos, self._rot = tensor(data.site_xpos[tcp]), tensor(data.site_xmat[tcp].reshape(3, 3))
         self._mass, self._com = (tensor(x) for x in _lumps(model, data, first))
         self._lower = tensor(robot.lower[NUM_LEG_JOINTS:]) + MARGIN
@@ -62,13 +64,13 @@ class ArmKinematics:
 
     def _chain(self, q: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:
         """Axes and anchors (N, 6, 3) of the joints; of each link rotation (N, 3, 3) and shift (N, 3)."""
-        rot = torch.eye(3, device=q.device).expand(len(q), 3, 3)
+        rot = self._one.expand(len(q), 3, 3)
         shift = torch.zeros(len(q), 3, device=q.device)
         axes, anchors, rots, shifts = [], [], [], []
         for k, (axis, anchor) in enumerate(zip(self._axis, self._anchor, strict=True)):
             axes.append(rot @ axis)
             anchors.append(rot @ anchor + shift)
-            turn = rotation_about(axis, q[:, k])
+            turn = rotation_about(self._cross[k], q[:, k])
             shift = shift + (rot @ (anchor - turn @ anchor)[..., None])[..., 0]
             rot = rot @ turn
             rots.append(rot)
@@ -106,12 +108,19 @@ def _lumps(model: mujoco.MjModel, data: mujoco.MjData, first: int) -> tuple[np.n
     return mass, moment / mass[:, None]
 
 
-def rotation_about(axis: Tensor, angle: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) about a unit axis (3,) by angles (N,) [rad]. Source: Rodrigues' formula."""
+def cross_matrix(axis: Tensor) -> Tensor:
+    """The matrix (3, 3) whose product with a vector is the cross product of `axis` (3,) with it."""
     x, y, z = axis.tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], device=axis.device)
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], device=axis.device)
+
+
+def rotation_about(cross: Tensor, angle: Tensor) -> Tensor:
+    """Rotations (N, 3, 3) by angles (N,) [rad] about the unit axis of a `cross_matrix` (3, 3).
+
+    Source: Rodrigues' formula.
+    """
     sin, cos = angle.sin()[:, None, None], angle.cos()[:, None, None]
-    return torch.eye(3, device=axis.device) + sin * cross + (1 - cos) * (cross @ cross)
+    return torch.eye(3, device=cross.device) + sin * cross + (1 - cos) * (cross @ cross)
 
 
 def rotation_vector(rot: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from wbc_baselines.learned import inputs
-from wbc_baselines.learned.backends.base import Backend, State
+from wbc_baselines.learned.backends.base import Backend, Start, State
 from wbc_baselines.learned.methods import Reward
 from wbc_baselines.learned.pool import TargetPool
 from wbc_baselines.learned.reference import advance, initial_reference, pose_errors, twice_sine
@@ -79,6 +79,15 @@ class Step(NamedTuple):
     time_out: Tensor  # (N,) bool: done, and not by a fault of the policy
 
 
+class _Bank(NamedTuple):
+    """Episodes drawn ahead."""
+
+    number: int  # of the stream
+    severity: float
+    curriculum: float
+    taken: int = 0
+
+
 PRIVILEGED_COLUMNS = slice(inputs.OBSERVATION + inputs.COMMAND, None)  # of Seen.critic
 
 
@@ -106,7 +115,7 @@ class Environment:
         self._scale = self._tensor(self._robot.action_scale)
         self._noise = torch.zeros(1, self.num_envs, inputs.HISTORY_TERM, device=self.device)
         self._at = 0  # row of the noise
-        self._resets = 0
+        self._bank = _Bank(0, self.severity, self.curriculum)
         self.clear_log()
         self._start()
 
@@ -115,9 +124,9 @@ class Environment:
     def _start(self) -> None:
         """Episodes of all ages, so that they do not end together."""
         count = self.num_envs
-        draws = self._draw(count)
-        self._state = self._backend.reset(np.arange(count), draws.start)
-        self._episode = self._fresh_episode(draws, self._state)
+        self._draw(self._bank)
+        start, self._episode = self._take(count)
+        self._state = self._backend.reset(torch.arange(count, device=self.device), start)
         self._view = self._derive(self._state, self._state, self._episode)
         rng = stream(self._seed, "training age")
         age = torch.from_numpy(rng.integers(0, self.protocol.num_steps, count)).to(self.device)
@@ -128,32 +137,50 @@ class Environment:
         )
         self.seen = self._see()
 
-    def _draw(self, count: int) -> Draws:
-        rng = stream(self._seed, "training start", self._resets)
-        self._resets += 1
-        protocol = weakened(self.protocol, self.severity)
-        return draw_starts(protocol, self._pool, count, rng, self.curriculum)
+    def _draw(self, bank: "_Bank") -> None:
+        """Draw as many episodes as there are environments, ahead of their use: one transfer to a GPU."""
+        rng = stream(self._seed, "training start", bank.number)
+        protocol = weakened(self.protocol, bank.severity)
+        draws = draw_starts(protocol, self._pool, self.num_envs, rng, bank.curriculum)
+        self._bank = bank
+        self._starts = Start(*(column.to(self.device) for column in draws.start))
+        self._episodes = self._fresh_episodes(draws)
 
-    def _fresh_episode(self, draws: Draws, state: State) -> Episode:
+    def _take(self, count: int) -> tuple[Start, Episode]:
+        """The next `count` episodes; where fewer are left, new ones are drawn and those dropped."""
+        bank = self._bank
+        if bank.taken + count > self.num_envs:
+            self._draw(_Bank(bank.number + 1, self.severity, self.curriculum))
+            bank = self._bank
+        rows = slice(bank.taken, bank.taken + count)
+        self._bank = bank._replace(taken=bank.taken + count)
+        return Start(*(column[rows] for column in self._starts)), Episode(*(x[rows] for x in self._episodes))
+
+    def _fresh_episodes(self, draws: Draws) -> Episode:
         start, chosen, count = draws.start, draws.target, len(draws.target)
-        zero = torch.zeros(count, device=self.device)
-        whole = torch.zeros(count, dtype=torch.int64, device=self.device)
+
+        def zero() -> Tensor:
+            return torch.zeros(count, device=self.device)
+
+        def none() -> Tensor:
+            return torch.zeros(count, dtype=torch.int64, device=self.device)
+
         dynamics = [start.kp_scale, start.kd_scale, start.base_mass[:, None], start.friction[:, None]]
         return Episode(
             target_pos_w=self._tensor(self._pool.pos_w[chosen]),
             target_rot_w=self._tensor(matrix_from_wxyz(self._pool.quat_w[chosen].astype(np.float64))),
             stratum=torch.from_numpy(self._pool.stratum[chosen].astype(np.int64)).to(self.device),
-            decay=self._tensor(draws.decay),
-            push_step=torch.from_numpy(draws.push_step).to(self.device),
-            push_vel=self._tensor(draws.push_vel),
-            dynamics=self._tensor(np.concatenate(dynamics, axis=1)),
-            step=whole,
+            decay=draws.decay.float().to(self.device),
+            push_step=draws.push_step.to(self.device),
+            push_vel=draws.push_vel.float().to(self.device),
+            dynamics=torch.cat(dynamics, 1).float().to(self.device),
+            step=none(),
             action=torch.zeros(count, NUM_JOINTS, device=self.device),
-            d_ref=zero.clone(),
-            best_pos_error=zero.clone(),
-            best_rot_error=zero.clone(),
-            inside=whole.clone(),
-            earned=zero,
+            d_ref=zero(),
+            best_pos_error=zero(),
+            best_rot_error=zero(),
+            inside=none(),
+            earned=zero(),
         )
 
     def _begin(self, episode: Episode, view: View) -> None:
@@ -165,9 +192,8 @@ class Environment:
         ids = done.nonzero()[:, 0]
         if len(ids) == 0:
             return
-        draws = self._draw(len(ids))
-        state = self._backend.reset(ids.cpu().numpy(), draws.start)
-        episode = self._fresh_episode(draws, state)
+        start, episode = self._take(len(ids))
+        state = self._backend.reset(ids, start)
         view = self._derive(state, state, episode)
         self._begin(episode, view)
         self._state.put(ids, state)
@@ -177,24 +203,24 @@ class Environment:
     # ---- one step ------------------------------------------------------------------------------------------
 
     def begin_rollout(self, iteration: int, steps: int) -> None:
-        """Draw the observation noise of the next `steps` steps at once."""
-        rng = stream(self._seed, "training noise", iteration)
-        unit = rng.random((steps, self.num_envs, inputs.HISTORY_TERM), dtype=np.float32)
+        """Draw the observation noise of the next `steps` steps at once, on the device."""
+        seed = int(stream(self._seed, "training noise", iteration).integers(2**62))
+        generator = torch.Generator(self.device).manual_seed(seed)
+        shape = (steps, self.num_envs, inputs.HISTORY_TERM)
+        unit = torch.rand(shape, generator=generator, device=self.device)
         half = self._tensor(noise_half_widths(weakened(self.protocol, self.severity)))
-        self._noise = torch.from_numpy(unit).to(self.device).mul_(2).sub_(1).mul_(half)
+        self._noise = unit.mul_(2).sub_(1).mul_(half)
         self._at = 0
+        self._backend.check()
 
     @torch.no_grad()
     def step(self, action: Tensor) -> Step:
         """Apply normalised actions (N, 14) for one control period."""
         protocol, episode, before = self.protocol, self._episode, self._state
-        self._push()
+        now = (episode.push_step == episode.step[:, None])[..., None]
+        self._backend.push((episode.push_vel * now).sum(1))
         state = self._backend.step(self._default_q + self._scale * action)
-        if state.diverged.any():  # keeps its last sound state, so that no sum meets a NaN
-            ids = state.diverged.nonzero()[:, 0]
-            diverged = state.diverged.clone()
-            state.put(ids, State(*(field[ids] for field in before)))
-            state = state._replace(diverged=diverged)
+        state = state.where_sound(before)
         view = self._derive(state, before, episode)
         episode.step.add_(1)
         episode.d_ref[:] = advance(episode.d_ref, episode.decay, protocol.control_period)
@@ -220,13 +246,6 @@ class Environment:
         self.seen = self._see()
         self._at += 1
         return Step(self.seen, reward, done, time_out)
-
-    def _push(self) -> None:
-        episode = self._episode
-        now = episode.push_step == episode.step[:, None]
-        ids = now.any(-1).nonzero()[:, 0]
-        if len(ids):
-            self._backend.push(ids, (episode.push_vel[ids] * now[ids][..., None]).sum(1))
 
     def _derive(self, state: State, before: State, episode: Episode) -> View:
         rate = 1 / self.protocol.control_period  # [1/s]
@@ -341,14 +360,15 @@ class Environment:
 
     def clear_log(self) -> None:
         """Forget what has been counted."""
-        self._sums: dict[str, Tensor] = {}
+        self._sums: Tensor | float = 0.0  # of the means named in `_named`
+        self._named: list[str] = []
         self._steps = 0
         self._ended = torch.zeros(len(STRATA), 1 + len(OUTCOMES), dtype=torch.float64, device=self.device)
 
     def _log(
         self,
         terms: dict[str, Tensor],
-        gates: dict[str, Tensor | float],
+        gates: dict[str, Tensor],
         view: View,
         done: Tensor,
         time_out: Tensor,
@@ -356,11 +376,8 @@ class Environment:
     ) -> None:
         self._steps += 1
         named = {f"reward/{k}": v for k, v in terms.items()} | {f"gate/{k}": v for k, v in gates.items()}
-        for name, value in named.items():
-            self._sums[name] = self._sums.get(name, 0.0) + torch.as_tensor(value).mean()
-        ids = done.nonzero()[:, 0]
-        if len(ids) == 0:
-            return
+        self._named = list(named)
+        self._sums = self._sums + torch.stack(list(named.values())).mean(-1)
         episode = self._episode
         held = time_out & (episode.inside >= self.protocol.window_steps)
         fell = done & ~time_out & ~diverged
@@ -370,8 +387,8 @@ class Environment:
             *(torch.where(time_out, error, nothing) for error in (view.pos_error, view.rot_error)),
             time_out,
         ]
-        rows = torch.stack([column[ids].double() for column in columns], -1)
-        self._ended.index_add_(0, episode.stratum[ids], rows)
+        rows = torch.stack([torch.where(done, column, 0).double() for column in columns], -1)
+        self._ended.index_add_(0, episode.stratum, rows)
 
     def log(self) -> dict[str, float]:
         """Means since `clear_log`: reward terms a step, gates, outcomes of the episodes that ended.
@@ -379,7 +396,8 @@ class Environment:
         Success and falls are shares of ended episodes; the errors those at the end of episodes that lasted.
         Where no episode ended, NaN.
         """
-        found = {name: float(value) / self._steps for name, value in self._sums.items()}
+        sums = torch.as_tensor(self._sums).tolist() if self._named else []
+        found = {name: value / self._steps for name, value in zip(self._named, sums, strict=True)}
         ended = self._ended.cpu().numpy()
         for name, row in [("", ended.sum(0)), *((f"_{s}", ended[k]) for k, s in enumerate(STRATA))]:
             episodes, success, fell, diverged, length, earned, pos, rot, lasted = row
@@ -406,7 +424,7 @@ class Environment:
             "episode": self._episode._asdict(),
             "view": self._view._asdict(),
             "seen": self.seen._asdict(),
-            "resets": self._resets,
+            "bank": self._bank._asdict(),
         }
 
     def load(self, saved: dict) -> None:
@@ -415,7 +433,8 @@ class Environment:
         for kind, name in ((State, "_state"), (Episode, "_episode"), (View, "_view"), (Seen, "seen")):
             fields = {k: v.to(self.device) for k, v in saved[name.strip("_")].items()}
             setattr(self, name, kind(**fields))
-        self._resets = saved["resets"]
+        bank = _Bank(**saved["bank"])
+        self._draw(bank)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float32, device=self.device)

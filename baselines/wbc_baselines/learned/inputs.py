@@ -194,11 +194,16 @@ class History:
         """Start the robots `ids` (K,) anew from their first terms (K, 57)."""
         self.window[ids] = term[:, None]
 
-    def push(self, term: "Tensor") -> None:
-        """Forget the oldest term and append one, (N, 57); the window of before stays as it was."""
+    def push(self, term: "Tensor", fresh: "Tensor | None" = None) -> None:
+        """Forget the oldest term and append one, (N, 57); the window of before stays as it was.
+
+        Where fresh (N,) bool, an episode starts with the term.
+        """
         import torch
 
         self.window = torch.cat([self.window[:, 1:], term[:, None]], dim=1)
+        if fresh is not None:
+            self.window = torch.where(fresh[:, None, None], term[:, None], self.window)
 
 
 def rows() -> list[tuple[str, ...]]:

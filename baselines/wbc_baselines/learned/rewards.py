@@ -154,7 +154,7 @@ def gates_of(phase: Tensor, s_m: Tensor, s_l: Tensor) -> Gates:
 
 def rewards(
     signals: Signals, body: Body, kind: Reward, period: float
-) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor | float]]:
+) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
     """The reward of one control step of `period` [s].
 
     Returns:
@@ -189,7 +189,7 @@ def rewards(
     }
     terms = {name: value * (SCALES[name] * period) for name, value in raw.items()}
     total = torch.stack(list(terms.values())).sum(0).clamp(-BOUND, BOUND)
-    return total, terms, measured._asdict()
+    return total, terms, {name: torch.as_tensor(value) for name, value in measured._asdict().items()}
 
 
 def progress(signals: Signals) -> Tensor:

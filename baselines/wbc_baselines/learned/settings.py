@@ -62,6 +62,9 @@ class Settings:
     the first half the teacher drives in a part of the environments, at first in all."""
     arm_teaching: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
+    mirror: bool = False
+    """Whether PPO also learns from the mirror image of every sample; for methods without an estimator, whose
+    inputs have one."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
     std_legs: tuple[float, float] = (0.1, 0.1)
@@ -149,6 +152,11 @@ class Settings:
         if not 0.0 <= begin <= end:
             raise TrainingError(
                 f"--arm-teaching {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
+            )
+        if self.mirror and METHODS[self.method].estimator not in ("none", "oracle"):
+            valid = ", ".join(name for name, m in METHODS.items() if m.estimator in ("none", "oracle"))
+            raise TrainingError(
+                f"--mirror with --method {self.method}: valid: {valid}, which estimate nothing"
             )
         if self.envs * self.steps < self.minibatches:
             raise TrainingError(

@@ -4,7 +4,9 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from wbc_baselines.learned.backends.base import Start
 from wbc_baselines.learned.pool import TargetPool
@@ -24,9 +26,9 @@ class Draws(NamedTuple):
 
     start: Start
     target: NDArray[np.int64]  # (K,) row of the pool
-    decay: Array  # (K,) [1/s]
-    push_step: NDArray[np.int64]  # (K, MAX_PUSHES) control step before which it comes, -1 for none
-    push_vel: Array  # (K, MAX_PUSHES, 2) [m/s]
+    decay: Tensor  # (K,) [1/s]
+    push_step: Tensor  # (K, MAX_PUSHES) control step before which it comes, -1 for none
+    push_vel: Tensor  # (K, MAX_PUSHES, 2) [m/s]
 
 
 def shares(protocol: EvalProtocol, curriculum: float) -> Array:
@@ -62,12 +64,15 @@ def weakened(protocol: EvalProtocol, severity: float) -> EvalProtocol:
 def draw_starts(
     protocol: EvalProtocol, pool: TargetPool, count: int, rng: np.random.Generator, curriculum: float = 1.0
 ) -> Draws:
-    """`count` episodes; the distributions are those of an evaluation's manifest (wbc_bench.randomization)."""
+    """`count` episodes; the distributions are those of an evaluation's manifest (wbc_bench.randomization).
+
+    On the host.
+    """
     spread = protocol.randomization
     leg_q = rng.uniform(-spread.leg_q, spread.leg_q, (count, NUM_LEG_JOINTS))
     velocity = np.repeat([spread.base_lin_vel, spread.base_ang_vel], 3)
     push_step, push_vel = draw_pushes(protocol, count, rng)
-    start = Start(
+    columns = dict(
         base_height=np.array([resting_height(protocol.robot, q) for q in leg_q]),
         friction=rng.uniform(*spread.friction, count),
         base_mass=rng.uniform(*spread.base_mass, count),
@@ -84,7 +89,9 @@ def draw_starts(
         members = np.flatnonzero(pool.stratum == k)
         mine = stratum == k
         target[mine] = members[(within[mine] * len(members)).astype(np.int64)]
-    return Draws(start, target, rng.uniform(*DECAY, count), push_step, push_vel)
+    start = Start(**{name: torch.from_numpy(column) for name, column in columns.items()})
+    decay = rng.uniform(*DECAY, count)
+    return Draws(start, target, *map(torch.from_numpy, (decay, push_step, push_vel)))
 
 
 def draw_pushes(

@@ -11,10 +11,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_baselines.learned.inputs import COMMAND_LAYOUT, OBSERVATION_LAYOUT, width
+from wbc_baselines.learned.inputs import COMMAND_LAYOUT, OBSERVATION_LAYOUT, PRIVILEGED_LAYOUT, width
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 
 POLAR, AXIAL = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)  # signs of x, y, z
+SAME = (1.0,)
 
 
 class Mirror(NamedTuple):
@@ -42,15 +43,38 @@ def joint_mirror(robot: Robot) -> Mirror:
 
 def input_mirror(robot: Robot) -> Mirror:
     """Of what a policy without context sees, observation and command (..., 67)."""
+    joints, pose = joint_mirror(robot), (POLAR, POLAR, AXIAL)  # position, first and second column
+    mirror = _side_by_side(AXIAL, POLAR, joints, joints, joints, *pose, SAME, *pose)
+    assert len(mirror.place) == width(OBSERVATION_LAYOUT) + width(COMMAND_LAYOUT)
+    return mirror
+
+
+def privileged_mirror(robot: Robot) -> Mirror:
+    """Of what only a simulation knows, (..., 80); what stands in the world frame, about its plane y = 0."""
     joints = joint_mirror(robot)
-    same = Mirror(np.arange(1), np.ones(1, np.float32))
-    polar, axial = (Mirror(np.arange(3), np.array(signs, np.float32)) for signs in (POLAR, AXIAL))
-    pose = (polar, polar, axial)  # position, first and second column
-    parts = (axial, polar, joints, joints, joints, *pose, same, *pose)
-    sizes = [len(part.place) for part in parts]
-    assert sum(sizes) == width(OBSERVATION_LAYOUT) + width(COMMAND_LAYOUT)
-    starts = np.cumsum([0, *sizes[:-1]])
+    factors = Mirror(joints.place, np.ones_like(joints.sign))
+    feet = Mirror(np.roll(np.arange(6), 3), np.array(2 * POLAR, np.float32))
+    mirror = _side_by_side(
+        *(POLAR, joints, joints, SAME, POLAR, AXIAL, feet),  # velocity to soles
+        *(factors, factors, SAME, SAME, feet),  # gains, mass, friction, forces
+    )
+    assert len(mirror.place) == width(PRIVILEGED_LAYOUT)
+    return mirror
+
+
+def critic_mirror(robot: Robot) -> Mirror:
+    """Of what the critic sees without a context, (..., 147)."""
+    return _side_by_side(input_mirror(robot), privileged_mirror(robot))
+
+
+def _side_by_side(*parts: Mirror | tuple[float, ...]) -> Mirror:
+    """Of vectors whose neighbouring columns have these mirrors, or keep their places and have these signs."""
+    mirrors = [
+        part if isinstance(part, Mirror) else Mirror(np.arange(len(part)), np.array(part, np.float32))
+        for part in parts
+    ]
+    starts = np.cumsum([0, *(len(mirror.place) for mirror in mirrors)])
     return Mirror(
-        np.concatenate([start + part.place for start, part in zip(starts, parts, strict=True)]),
-        np.concatenate([part.sign for part in parts]),
+        np.concatenate([start + m.place for start, m in zip(starts[:-1], mirrors, strict=True)]),
+        np.concatenate([m.sign for m in mirrors]),
     )

@@ -29,6 +29,7 @@ from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.networks import HIDDEN, Actor
 from wbc_baselines.learned.pool import TargetPool, read_pool
 from wbc_baselines.learned.settings import Settings, TrainingError
+from wbc_baselines.learned.symmetry import critic_mirror, input_mirror, joint_mirror, privileged_mirror
 from wbc_baselines.learned.teaching import ArmTeaching, Fit, Teaching
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
@@ -116,6 +117,8 @@ class Trainer:
         self._origins = tuple(checkpoint.identity(name) for name in (settings.start, settings.teacher))
         if settings.backend == "cpu":
             torch.set_num_threads(settings.threads)
+        else:
+            torch.set_float32_matmul_precision("high")
         torch.manual_seed(_key(settings.seed, "weights"))
         self.estimator = make_estimator(self.method.estimator).to(self.device)
         start = None
@@ -181,6 +184,7 @@ class Trainer:
             schedule="adaptive",
             desired_kl=settings.desired_kl,
             device=str(self.device),
+            symmetry_cfg=self._symmetry() if settings.mirror else None,
         )
         groups = [{"params": list(model.parameters())} for model in (actor, critic)]
         ppo.optimizer = torch.optim.Adam(groups, settings.learning_rate)
@@ -198,6 +202,32 @@ class Trainer:
         # PPO has one rate for both, without a lower bound, and no critic that learns alone
         ppo.optimizer.register_step_pre_hook(set_rates)
         return ppo
+
+    def _symmetry(self) -> dict:
+        """rsl-rl's extension, with a function that puts the mirror images behind the samples."""
+        robot = load_robot(self.environment.protocol.robot)
+        mirrors = {
+            "policy": input_mirror(robot),
+            "critic": critic_mirror(robot),
+            "context": privileged_mirror(robot),
+        }
+        mirrors["action"] = joint_mirror(robot)
+        images = {
+            name: (torch.from_numpy(m.place).to(self.device), torch.from_numpy(m.sign).to(self.device))
+            for name, m in mirrors.items()
+        }
+
+        def both(name: str, x: Tensor) -> Tensor:
+            place, sign = images[name]
+            return torch.cat([x, x[..., place] * sign])
+
+        def augment(env: object, obs: TensorDict | None, actions: Tensor | None) -> tuple:
+            if obs is not None:
+                groups = {name: both(name, obs[name]) for name in obs.keys()}  # noqa: SIM118
+                obs = TensorDict(groups, batch_size=[2 * len(obs)], device=self.device)
+            return obs, None if actions is None else both("action", actions)
+
+        return {"env": None, "data_augmentation_func": augment, "use_data_augmentation": True}
 
     # ---- one iteration -------------------------------------------------------------------------------------
 
@@ -286,11 +316,8 @@ class Trainer:
         return rollout
 
     def _advance_context(self, step: Step) -> None:
-        self._history.push(step.seen.term)
-        ids = step.done.nonzero()[:, 0]
-        if len(ids):
-            self._history.reset(ids, step.seen.term[ids])
-            self._state[ids] = 0.0
+        self._history.push(step.seen.term, fresh=step.done)
+        self._state = torch.where(step.done[:, None], 0.0, self._state)
         self._start = step.done
         self._context = self._estimate()
 

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple, Protocol
 
-import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -13,16 +12,16 @@ MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10
 
 
 class Start(NamedTuple):
-    """How K episodes start: columns as those of an evaluation's manifest, on the host."""
+    """How K episodes start: columns as those of an evaluation's manifest, float64."""
 
-    base_height: NDArray[np.float64]  # (K,) [m]
-    friction: NDArray[np.float64]  # (K,)
-    base_mass: NDArray[np.float64]  # (K,) [kg] added
-    base_vel: NDArray[np.float64]  # (K, 6) linear in the world [m/s], angular in the base [rad/s]
-    leg_q: NDArray[np.float64]  # (K, 8) [rad] added to the default posture
-    leg_qd: NDArray[np.float64]  # (K, 8) [rad/s]
-    kp_scale: NDArray[np.float64]  # (K, 14)
-    kd_scale: NDArray[np.float64]  # (K, 14)
+    base_height: Tensor  # (K,) [m]
+    friction: Tensor  # (K,)
+    base_mass: Tensor  # (K,) [kg] added
+    base_vel: Tensor  # (K, 6) linear in the world [m/s], angular in the base [rad/s]
+    leg_q: Tensor  # (K, 8) [rad] added to the default posture
+    leg_qd: Tensor  # (K, 8) [rad/s]
+    kp_scale: Tensor  # (K, 14)
+    kd_scale: Tensor  # (K, 14)
 
 
 class State(NamedTuple):
@@ -43,6 +42,14 @@ class State(NamedTuple):
         """Overwrite the simulations `ids` (K,) with the rows of another state."""
         for mine, theirs in zip(self, rows, strict=True):
             mine[ids] = theirs
+
+    def where_sound(self, before: "State") -> "State":
+        """This state, but the one before where a simulation has diverged: no sum meets a NaN."""
+        rows = []
+        for now, then in zip(self, before, strict=True):
+            lost = self.diverged.reshape(-1, *[1] * (now.ndim - 1))
+            rows.append(torch.where(lost, then, now))
+        return State(*rows)._replace(diverged=self.diverged)
 
 
 def state_of(
@@ -71,16 +78,20 @@ class Backend(Protocol):
     num_envs: int
     device: torch.device
 
-    def reset(self, ids: NDArray[np.int64], start: Start) -> State:
+    def reset(self, ids: Tensor, start: Start) -> State:
         """Start the simulations `ids` (K,) anew; their state, K rows."""
         ...
 
-    def push(self, ids: Tensor, velocity_w: Tensor) -> None:
-        """Add (K, 2) [m/s] to the base's horizontal velocity of `ids` (K,)."""
+    def push(self, velocity_w: Tensor) -> None:
+        """Add (N, 2) [m/s] to the base's horizontal velocity, zero for no push."""
         ...
 
     def step(self, command: Tensor) -> State:
         """Track joint commands (N, 14) [rad] for one control period."""
+        ...
+
+    def check(self) -> None:
+        """Raise a `TrainingError` if a step since the last call cannot be trusted."""
         ...
 
     def save(self) -> dict[str, NDArray]:

@@ -1,5 +1,7 @@
 """MuJoCo's batch API: the C engine of the evaluation, on a few threads."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import torch
@@ -33,20 +35,22 @@ class CpuBackend:
         self._places = places_of(model)
         self._base = model.body(robot.facts.base).id
 
-    def reset(self, ids: NDArray[np.int64], start: Start) -> State:
-        self._randomise(ids, start)
-        self._batch.reset(ids, stage=_STAGE_NONE)
+    def reset(self, ids: Tensor, start: Start) -> State:
+        rows: NDArray[np.int64] = ids.numpy()
+        drawn: Any = Start(*(column.numpy() for column in start))
+        self._randomise(rows, drawn)
+        self._batch.reset(rows, stage=_STAGE_NONE)
         default = self._robot.default_q
-        qpos, qvel = np.zeros((len(ids), 21)), np.zeros((len(ids), 20))
-        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = start.base_height, 1.0, default
-        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += start.leg_q
-        qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = start.base_vel, start.leg_qd
-        self._state["qpos"][ids], self._state["qvel"][ids] = qpos, qvel
-        self._state["ctrl"][ids] = default
-        self._batch.forward(ids)
-        return self._read(ids)
+        qpos, qvel = np.zeros((len(rows), 21)), np.zeros((len(rows), 20))
+        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = drawn.base_height, 1.0, default
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += drawn.leg_q
+        qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = drawn.base_vel, drawn.leg_qd
+        self._state["qpos"][rows], self._state["qvel"][rows] = qpos, qvel
+        self._state["ctrl"][rows] = default
+        self._batch.forward(rows)
+        return self._read(rows)
 
-    def _randomise(self, ids: NDArray[np.int64], start: Start) -> None:
+    def _randomise(self, ids: NDArray[np.int64], start: Any) -> None:
         """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
         model, fields, base = self._model, self._fields, self._base
         # the larger coefficient of a pair counts, so both sides carry the draw
@@ -59,8 +63,8 @@ class CpuBackend:
         fields["actuator_biasprm"][ids, :, 2] = model.actuator_biasprm[:, 2] * start.kd_scale
         self._batch.set_const(ids)
 
-    def push(self, ids: Tensor, velocity_w: Tensor) -> None:
-        self._state["qvel"][ids.numpy(), :2] += velocity_w.numpy()
+    def push(self, velocity_w: Tensor) -> None:
+        self._state["qvel"][:, :2] += velocity_w.numpy()
 
     def step(self, command: Tensor) -> State:
         self._state["ctrl"][:] = command.numpy()
@@ -77,6 +81,9 @@ class CpuBackend:
         state = state_of(self._places, qpos, qvel, take(self._out["actuator_force"]), pos, rot, sensor)
         fatal = torch.from_numpy((self._batch.warning[ids][:, FATAL_WARNINGS, 1] > 0).any(1))
         return state._replace(diverged=state.diverged | fatal)
+
+    def check(self) -> None:
+        pass  # the engine's warnings are read at every step
 
     def save(self) -> dict[str, NDArray]:
         return {name: array.copy() for name, array in (self._state | self._fields).items()}
