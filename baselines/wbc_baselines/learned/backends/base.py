@@ -52,12 +52,26 @@ class State(NamedTuple):
         return State(*rows)._replace(diverged=self.diverged)
 
 
+class Columns(NamedTuple):
+    """`Places` on the device of the arrays: an index from the host would stop a GPU at every use."""
+
+    tcp: int  # site
+    soles: Tensor  # (2,) sites
+    force: Tensor  # (6,) columns of the sensors
+    ground: Tensor  # columns of the sensors
+
+
+def columns_of(places: Places, device: torch.device) -> Columns:
+    """See `Columns`."""
+    indices = (places.soles, places.sole_force.ravel(), places.ground)
+    return Columns(places.tcp, *(torch.as_tensor(index, device=device) for index in indices))
+
+
 def state_of(
-    places: Places, qpos: Tensor, qvel: Tensor, torque: Tensor, pos: Tensor, rot: Tensor, sensor: Tensor
+    columns: Columns, qpos: Tensor, qvel: Tensor, torque: Tensor, pos: Tensor, rot: Tensor, sensor: Tensor
 ) -> State:
     """The state in arrays of an engine: sites' `pos` (N, S, 3) and `rot` (N, S, 3, 3), `sensor` (N, C)."""
-    tcp, soles = places.tcp, places.soles
-    force, ground = places.sole_force.ravel().tolist(), places.ground.tolist()
+    tcp, soles, force, ground = columns
     return State(
         qpos=qpos,
         qvel=qvel,

@@ -9,7 +9,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.backends.base import Start, State, state_of
+from wbc_baselines.learned.backends.base import Start, State, columns_of, state_of
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 from wbc_bench.simulation import FATAL_WARNINGS, places_of
@@ -32,7 +32,7 @@ class CpuBackend:
         self._fields = {name: batch.expand(name) for name in _MODEL}
         outputs = {name: batch.bind(name) for name in ("site_xpos", "site_xmat", "sensordata")}
         self._out = outputs | {"actuator_force": batch.bind("actuator_force")}
-        self._places = places_of(model)
+        self._columns = columns_of(places_of(model), self.device)
         self._base = model.body(robot.facts.base).id
 
     def reset(self, ids: Tensor, start: Start) -> State:
@@ -78,7 +78,7 @@ class CpuBackend:
         qpos, qvel = take(self._state["qpos"]), take(self._state["qvel"])
         pos, rot = take(self._out["site_xpos"]), take(self._out["site_xmat"]).unflatten(-1, (3, 3))
         sensor = take(self._out["sensordata"])
-        state = state_of(self._places, qpos, qvel, take(self._out["actuator_force"]), pos, rot, sensor)
+        state = state_of(self._columns, qpos, qvel, take(self._out["actuator_force"]), pos, rot, sensor)
         fatal = torch.from_numpy((self._batch.warning[ids][:, FATAL_WARNINGS, 1] > 0).any(1))
         return state._replace(diverged=state.diverged | fatal)
 

@@ -17,7 +17,7 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.backends.base import Start, State, state_of
+from wbc_baselines.learned.backends.base import Start, State, columns_of, state_of
 from wbc_baselines.learned.settings import TrainingError
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
@@ -59,7 +59,7 @@ class WarpBackend:
         self._fields = {name: wp.to_torch(getattr(self._m, name)) for name in (*_MODEL, *_DERIVED)}
         outputs = ("site_xpos", "site_xmat", "actuator_force", "sensordata", "overflow")
         self._out = {name: wp.to_torch(getattr(self._d, name)) for name in outputs}
-        self._places = places_of(model)
+        self._columns = columns_of(places_of(model), self.device)
         self._base = model.body(self._robot.facts.base).id
         robot = self._robot
         self._default_q, self._kp, self._kd, self._effort = (
@@ -176,7 +176,7 @@ class WarpBackend:
 
         qpos, qvel, sensor = take("qpos"), take("qvel"), take("sensordata")
         pos, rot = take("site_xpos"), take("site_xmat")
-        state = state_of(self._places, qpos, qvel, take("actuator_force"), pos, rot, sensor)
+        state = state_of(self._columns, qpos, qvel, take("actuator_force"), pos, rot, sensor)
         return state._replace(diverged=state.diverged | ((take("overflow") & _OF_ONE) != 0))
 
     def save(self) -> dict[str, NDArray]:
