@@ -17,6 +17,7 @@ from wbc_baselines.learned.backends.base import Start  # noqa: E402
 from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.environment import Environment, noise_half_widths, rotation_from_wxyz  # noqa: E402
 from wbc_baselines.learned.pool import POOLS, TargetPool, digest, draw_pool, read_pool, write_pool  # noqa: E402
+from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
 from wbc_baselines.learned.starts import (  # noqa: E402
     DECAY,
     FIRST_SHARES,
@@ -25,6 +26,7 @@ from wbc_baselines.learned.starts import (  # noqa: E402
     shares,
     weakened,
 )
+from wbc_baselines.learned.training import training_protocol  # noqa: E402
 from wbc_bench import randomization  # noqa: E402
 from wbc_bench.episodes import STRATA  # noqa: E402
 from wbc_bench.errors import ManifestError  # noqa: E402
@@ -202,6 +204,21 @@ def test_pushes_are_the_manifests():
             step[0], np.where(np.isnan(time), -1, np.round(np.nan_to_num(time) / 0.02))
         )
         np.testing.assert_array_equal(velocity[0].ravel(), expected)
+
+
+def test_training_may_push_more_often():
+    """As many as fit, each within the interval asked for, none in the quiet end."""
+    often = training_protocol(Settings("no_latent", push_interval=(1.5, 3.0)))
+    step, velocity = draw_pushes(often, 400, stream(1, "test"))
+    assert step.shape == (400, 6) and velocity.shape == (400, 6, 2)
+    came = step >= 0
+    assert set(came.sum(1)) <= {2, 3, 4, 5} and came.sum() > 3 * 400 * 0.9
+    gaps = np.diff(step, axis=1, prepend=0)[came]
+    assert gaps.min() >= 75 - 1 and gaps.max() <= 150 + 1
+    assert step.max() < PROTOCOL.num_steps - PROTOCOL.push.quiet_end / PROTOCOL.control_period + 1
+    assert (velocity[~came] == 0).all()
+    with pytest.raises(TrainingError, match=r"--push-interval 3 1\.5: valid: 0 < least <= most"):
+        Settings("no_latent", push_interval=(3.0, 1.5)).check()
 
 
 def test_a_push_comes_at_its_step():

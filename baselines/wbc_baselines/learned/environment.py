@@ -48,8 +48,8 @@ class Episode(NamedTuple):
     target_rot_w: Tensor  # (N, 3, 3)
     stratum: Tensor  # (N,)
     decay: Tensor  # (N,) [1/s]
-    push_step: Tensor  # (N, MAX_PUSHES)
-    push_vel: Tensor  # (N, MAX_PUSHES, 2) [m/s]
+    push_step: Tensor  # (N, P)
+    push_vel: Tensor  # (N, P, 2) [m/s]
     dynamics: Tensor  # (N, 30) factors of kp and kd, added mass [kg], friction
     step: Tensor  # (N,) control steps done
     action: Tensor  # (N, 14) of the step before

@@ -82,6 +82,9 @@ class Settings:
     calm: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when noise, pushes and randomisation rise from none to the
     protocol's; 0 0 for all from the first step on: who learns to stand undisturbed does not learn to step."""
+    push_interval: tuple[float, float] = (0.0, 0.0)
+    """[s] between two pushes, least and most; 0 0 for the protocol's. Most steps of an episode show a robot
+    that stands: with more pushes more of them show how to stay up."""
     estimator_share: float = 0.125
     """Part of the environments whose rollouts train the estimator; drawn anew each iteration."""
     estimator_minibatches: int = 4
@@ -148,6 +151,11 @@ class Settings:
         begin, end = self.calm
         if not (0.0 <= begin < end or begin == end == 0.0):
             raise TrainingError(f"--calm {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for never")
+        least, most = self.push_interval
+        if not (0.0 < least <= most or least == most == 0.0):
+            raise TrainingError(
+                f"--push-interval {least:g} {most:g}: valid: 0 < least <= most, or 0 0 for the protocol's"
+            )
         begin, end = self.arm_teaching
         if not 0.0 <= begin <= end:
             raise TrainingError(

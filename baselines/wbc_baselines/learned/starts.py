@@ -27,8 +27,8 @@ class Draws(NamedTuple):
     start: Start
     target: NDArray[np.int64]  # (K,) row of the pool
     decay: Tensor  # (K,) [1/s]
-    push_step: Tensor  # (K, MAX_PUSHES) control step before which it comes, -1 for none
-    push_vel: Tensor  # (K, MAX_PUSHES, 2) [m/s]
+    push_step: Tensor  # (K, P) control step before which it comes, -1 for none
+    push_vel: Tensor  # (K, P, 2) [m/s]
 
 
 def shares(protocol: EvalProtocol, curriculum: float) -> Array:
@@ -97,10 +97,14 @@ def draw_starts(
 def draw_pushes(
     protocol: EvalProtocol, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """Steps (count, MAX_PUSHES) and jumps (count, MAX_PUSHES, 2) [m/s], as `randomization.draw_pushes`."""
+    """Steps (count, P) and jumps (count, P, 2) [m/s], as `randomization.draw_pushes`.
+
+    P is MAX_PUSHES, or what fits into an episode where training asks for more.
+    """
     push: Push = protocol.push
-    time = np.cumsum(rng.uniform(*push.interval, (count, MAX_PUSHES)), axis=1)
-    velocity = rng.uniform(-push.speed, push.speed, (count, MAX_PUSHES, 2))
+    most = max(MAX_PUSHES, int(protocol.episodes.horizon / push.interval[0]))
+    time = np.cumsum(rng.uniform(*push.interval, (count, most)), axis=1)
+    velocity = rng.uniform(-push.speed, push.speed, (count, most, 2))
     none = (time >= protocol.episodes.horizon - push.quiet_end) | (push.speed == 0)
     step = np.where(none, -1, np.round(time / protocol.control_period)).astype(np.int64)
     return step, np.where(none[..., None], 0.0, velocity)

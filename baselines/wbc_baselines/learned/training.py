@@ -36,7 +36,7 @@ from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 
 def training_protocol(settings: Settings) -> EvalProtocol:
-    """The protocol with the physics step of training.
+    """The protocol with the physics step and the pushes of training.
 
     Raises:
         TrainingError: the control period would not be the protocol's.
@@ -46,6 +46,9 @@ def training_protocol(settings: Settings) -> EvalProtocol:
         protocol.physics, timestep=settings.timestep, decimation=settings.decimation
     )
     changed = msgspec.structs.replace(protocol, physics=physics)
+    if settings.push_interval[1]:
+        push = msgspec.structs.replace(protocol.push, interval=settings.push_interval)
+        changed = msgspec.structs.replace(changed, push=push)
     if abs(changed.control_period - protocol.control_period) > 1e-9:
         raise TrainingError(
             f"--timestep {settings.timestep:g} s x --decimation {settings.decimation}: valid: a product of "
