@@ -172,7 +172,7 @@ def draw_rows(
 ) -> EpisodeManifest:
     """Training's episodes as rows of a manifest."""
     draws = draw_starts(protocol, pool, count, rng)
-    start, chosen = draws.start, draws.target
+    chosen, push_step = draws.target, draws.push_step.numpy()
     pos = pool.pos_w[chosen].astype(np.float64)
     none, number = np.full(count, "", dtype=object), np.arange(count)
     return EpisodeManifest(
@@ -185,9 +185,9 @@ def draw_rows(
         target_pos_w=pos,
         target_quat_w=pool.quat_w[chosen].astype(np.float64),
         witness_qpos=np.full((count, 21), np.nan),
-        **start._asdict(),
-        push_time=np.where(draws.push_step < 0, np.nan, draws.push_step * protocol.control_period),
-        push_vel=draws.push_vel.reshape(count, -1),
+        **{name: column.numpy() for name, column in draws.start._asdict().items()},
+        push_time=np.where(push_step < 0, np.nan, push_step * protocol.control_period),
+        push_vel=draws.push_vel.numpy().reshape(count, -1),
         noise_key=rng.integers(2**63 - 1, size=count),
         noise_scale=np.ones(count),
     )

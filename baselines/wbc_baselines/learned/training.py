@@ -226,7 +226,7 @@ class Trainer:
 
         def augment(env: object, obs: TensorDict | None, actions: Tensor | None) -> tuple:
             if obs is not None:
-                groups = {name: both(name, obs[name]) for name in obs.keys()}  # noqa: SIM118
+                groups = {name: both(name, obs[name]) for name in map(str, obs.keys())}
                 obs = TensorDict(groups, batch_size=[2 * len(obs)], device=self.device)
             return obs, None if actions is None else both("action", actions)
 

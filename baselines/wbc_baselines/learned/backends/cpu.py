@@ -1,6 +1,6 @@
 """MuJoCo's batch API: the C engine of the evaluation, on a few threads."""
 
-from typing import Any
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -37,7 +37,7 @@ class CpuBackend:
 
     def reset(self, ids: Tensor, start: Start) -> State:
         rows: NDArray[np.int64] = ids.numpy()
-        drawn: Any = Start(*(column.numpy() for column in start))
+        drawn = SimpleNamespace(**{name: column.numpy() for name, column in start._asdict().items()})
         self._randomise(rows, drawn)
         self._batch.reset(rows, stage=_STAGE_NONE)
         default = self._robot.default_q
@@ -50,7 +50,7 @@ class CpuBackend:
         self._batch.forward(rows)
         return self._read(rows)
 
-    def _randomise(self, ids: NDArray[np.int64], start: Any) -> None:
+    def _randomise(self, ids: NDArray[np.int64], start: SimpleNamespace) -> None:
         """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
         model, fields, base = self._model, self._fields, self._base
         # the larger coefficient of a pair counts, so both sides carry the draw
