@@ -66,6 +66,16 @@ def width(layout: Layout) -> int:
     return sum(term.size for term in layout)
 
 
+def columns(layout: Layout, term: str) -> slice:
+    """Where the first term whose name begins so stands in a vector of the layout."""
+    start = 0
+    for each in layout:
+        if each.name.startswith(term):
+            return slice(start, start + each.size)
+        start += each.size
+    raise KeyError(term)
+
+
 OBSERVATION = width(OBSERVATION_LAYOUT)
 COMMAND = width(COMMAND_LAYOUT)
 HISTORY_TERM = width(HISTORY_LAYOUT)

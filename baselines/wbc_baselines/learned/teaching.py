@@ -18,7 +18,7 @@ from wbc_baselines.learned.arm_ik import ArmKinematics
 from wbc_baselines.learned.checkpoint import Checkpoint
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS
 from wbc_baselines.learned.imitation import DELTA
-from wbc_baselines.learned.inputs import COMMAND, OBSERVATION
+from wbc_baselines.learned.inputs import COMMAND, OBSERVATION, OBSERVATION_LAYOUT, columns
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 
 PARTS = 18  # of a rollout's lessons, an update each; choice, 1024 lessons a part of 768 x 24
@@ -29,7 +29,9 @@ BLEND = 0.3  # of the way from the policy's arm to the taught one, an iteration;
 REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
 SETS_OUT, ARRIVES = 2.0, 0.5  # of the task-progress reference, while the arm leaves its default; choice
 ARM = slice(NUM_LEG_JOINTS, NUM_JOINTS)
-GRAVITY, JOINT_POS = slice(3, 6), slice(6, 6 + NUM_JOINTS)  # of the observation
+GRAVITY, JOINT_POS, REFERENCE = (
+    columns(OBSERVATION_LAYOUT, term) for term in ("projected gravity", "joint positions", "task-progress")
+)
 
 
 class Fit:
@@ -100,7 +102,7 @@ class ArmTeaching:
         q, command = self._default + seen[:, JOINT_POS][:, ARM], seen[:, OBSERVATION:][:, :COMMAND]
         there = self._arm.solve(q, command)
         miss = torch.linalg.vector_norm(self._arm.hand(there)[0] - command[:, :3], dim=-1)
-        way = ((SETS_OUT - seen[:, OBSERVATION - 1 : OBSERVATION]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
+        way = ((SETS_OUT - seen[:, REFERENCE]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
         weight = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp
         return (way * (there - self._default) + weight) / self._scale, miss < REACHED
 
