@@ -147,30 +147,6 @@ def test_a_lesson_moves_the_arm_a_part_of_the_way_where_it_reaches_and_leaves_th
     assert teaching.update(t.ppo.storage.observations) == {} and len(lessons) == 1
 
 
-def test_legs_are_taught_the_posture_where_the_robot_stands_still(monkeypatch):
-    """A fiftieth of what the measured posture lacks on the way to the target's, in actions; the arm stays."""
-    t = trainer(posture_teaching=(0.0, 3 * STEPS))
-    teaching = t.posture_teaching
-    assert teaching
-    t.environment.begin_rollout(0, TINY.steps)
-    t._roll_out()
-    seen = t.ppo.storage.observations
-    seen["still"][:] = 0.0
-    assert teaching.update(seen) == {}
-    seen["still"][1, 2:4] = 1.0
-    seen["critic"][1, 2:4, REFERENCE] = torch.tensor([ARRIVES, (SETS_OUT + ARRIVES) / 2])
-    own = t.ppo.actor(seen[1, 2:4]).detach()
-    posture, legs = seen["posture"][1, 2:4], seen["critic"][1, 2:4, 6:14]
-    lack = torch.tensor([[1.0], [0.5]]) * posture - legs
-    lessons = []
-    monkeypatch.setattr(teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
-    found = teaching.update(seen)
-    scale = torch.tensor(ROBOT.action_scale[:8], dtype=torch.float32)
-    torch.testing.assert_close(lessons[0][:, :8], own[:, :8] + 0.02 * lack / scale)
-    torch.testing.assert_close(lessons[0][:, 8:], own[:, 8:])
-    assert found["posture_teaching"] == pytest.approx(float(lack.square().mean().sqrt()), rel=1e-5)
-
-
 def test_the_arm_is_taught_beside_ppo_while_it_is_time():
     t, _ = arm_taught(arm_teaching=(STEPS, 3 * STEPS))
     taught = ["loss/arm_teaching" in t.iterate() for _ in range(4)]

@@ -20,7 +20,6 @@ from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 
 CONTACT_FORCE = 1.0  # [N] vertical, from which a sole counts as loaded. Source: Isaac Lab's contact sensor
-STILL, STILL_TURNING = 0.15, 0.3  # [m/s], [rad/s] of the base; choice
 OUTCOMES = ("success", "fell", "diverged", "length", "return", "pos_error", "rot_error", "timed_out")
 
 
@@ -48,7 +47,6 @@ class Episode(NamedTuple):
     target_pos_w: Tensor  # (N, 3) [m]
     target_rot_w: Tensor  # (N, 3, 3)
     stratum: Tensor  # (N,)
-    posture: Tensor  # (N, 8) [rad] legs about their default, where the target is in reach, see `TargetPool`
     decay: Tensor  # (N,) [1/s]
     push_step: Tensor  # (N, P)
     push_vel: Tensor  # (N, P, 2) [m/s]
@@ -70,8 +68,6 @@ class Seen(NamedTuple):
     term: Tensor  # (N, 57) noisy term of the estimators' window
     velocity: Tensor  # (N, 3) [m/s] true, base frame
     next_observation: Tensor  # (N, 49) without noise
-    posture: Tensor  # (N, 8) [rad] of the legs about their default, that the target asks for
-    still: Tensor  # (N, 1) 1 where the robot stands still and need not step, else 0
 
 
 class Step(NamedTuple):
@@ -174,7 +170,6 @@ class Environment:
             target_pos_w=self._tensor(self._pool.pos_w[chosen]),
             target_rot_w=self._tensor(matrix_from_wxyz(self._pool.quat_w[chosen].astype(np.float64))),
             stratum=torch.from_numpy(self._pool.stratum[chosen].astype(np.int64)).to(self.device),
-            posture=self._tensor(self._pool.leg_q[chosen]) - self._default_q[:NUM_LEG_JOINTS],
             decay=draws.decay.float().to(self.device),
             push_step=draws.push_step.to(self.device),
             push_vel=draws.push_vel.float().to(self.device),
@@ -359,16 +354,7 @@ class Environment:
             next_observation=inputs.next_observation(
                 ang_vel, view.gravity_b, view.joint_pos, joint_vel, view.ee, view.feet_b
             ),
-            posture=episode.posture,
-            still=self._stands_still(state, episode)[:, None].float(),
         )
-
-    def _stands_still(self, state: State, episode: Episode) -> Tensor:
-        loaded = (state.foot_force_w[..., 2].abs() > CONTACT_FORCE).all(-1)
-        speed = torch.linalg.vector_norm(state.qvel[:, :3], dim=-1)
-        turning = torch.linalg.vector_norm(state.qvel[:, 3:6], dim=-1)
-        in_place = episode.stratum != STRATA.index("step")
-        return in_place & loaded & (speed < STILL) & (turning < STILL_TURNING)
 
     # ---- the log -------------------------------------------------------------------------------------------
 

@@ -20,13 +20,11 @@ from numpy.typing import NDArray
 from wbc_bench.episodes import STRATA
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.protocol import EvalProtocol, WorkspaceTargets
-from wbc_bench.robot import NUM_LEG_JOINTS
 from wbc_bench.targets import draw_workspace_target
 
 SEED_OFFSET = 2**62  # added to the protocol's seed: no evaluation draws from such a key
 POOLS = Path(__file__).with_name("pools")  # ships with the package
 CHUNK = 30  # targets a task: about a second of work
-LEGS = slice(7, 7 + NUM_LEG_JOINTS)  # of a robot's qpos
 
 Progress = Callable[[int, int], None]  # (done, total)
 
@@ -37,7 +35,6 @@ class TargetPool(NamedTuple):
     stratum: NDArray[np.int8]  # (M,) index into STRATA
     pos_w: NDArray[np.float32]  # (M, 3) [m]
     quat_w: NDArray[np.float32]  # (M, 4) wxyz
-    leg_q: NDArray[np.float32]  # (M, 8) [rad] of the posture that proves it feasible
 
     def __len__(self) -> int:
         return len(self.stratum)
@@ -64,25 +61,25 @@ def draw_pool(
         protocol, episodes=msgspec.structs.replace(protocol.episodes, seed=seed)
     )
 
-    def work(start: int) -> list[tuple[int, NDArray, NDArray, NDArray]]:
+    def work(start: int) -> list[tuple[int, NDArray, NDArray]]:
         draws = [draw_workspace_target(shifted, 0, k) for k in range(start, min(start + CHUNK, count))]
-        return [(STRATA.index(d.stratum), d.pos_w, d.quat_w, d.witness_qpos[LEGS]) for d in draws]
+        return [(STRATA.index(draw.stratum), draw.pos_w, draw.quat_w) for draw in draws]
 
-    rows: list[tuple[int, NDArray, NDArray, NDArray]] = []
+    rows: list[tuple[int, NDArray, NDArray]] = []
     parts: Any = Parallel(n_jobs=workers, return_as="generator")(
         delayed(work)(start) for start in range(0, count, CHUNK)
     )
     for part in parts:
         rows.extend(part)
         progress(len(rows), count)
-    stratum, *columns = zip(*rows, strict=True)
-    return TargetPool(np.array(stratum, np.int8), *(np.array(column, np.float32) for column in columns))
+    stratum, pos, quat = zip(*rows, strict=True)
+    return TargetPool(np.array(stratum, np.int8), np.array(pos, np.float32), np.array(quat, np.float32))
 
 
 def write_pool(pool: TargetPool, protocol: EvalProtocol, path: Path) -> None:
     """Write a pool with the digest of what it was drawn for, at once or not at all."""
     columns = [pa.array(pool.stratum)]
-    for values in pool[1:]:
+    for values in (pool.pos_w, pool.quat_w):
         columns.append(pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1]))
     table = pa.Table.from_arrays(columns, names=list(TargetPool._fields))
     table = table.replace_schema_metadata({"protocol": protocol.name, "digest": digest(protocol)})
@@ -108,9 +105,6 @@ def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise ManifestError(f"target pool '{path}' is not readable parquet: {error}") from error
-    missing = ", ".join(name for name in TargetPool._fields if name not in table.column_names)
-    if missing:
-        raise ManifestError(f"target pool '{path}' has no {missing}: draw it again with `wbc-train targets`")
     made_for = (table.schema.metadata or {}).get(b"digest", b"").decode()
     if made_for != digest(protocol):
         raise ManifestError(
@@ -122,4 +116,4 @@ def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
         column = table[name].combine_chunks()
         return column.flatten().to_numpy().reshape(len(table), -1)
 
-    return TargetPool(table["stratum"].to_numpy(), *map(matrix, TargetPool._fields[1:]))
+    return TargetPool(table["stratum"].to_numpy(), matrix("pos_w"), matrix("quat_w"))

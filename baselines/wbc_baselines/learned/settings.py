@@ -65,9 +65,6 @@ class Settings:
     mirror: bool = False
     """Whether PPO also learns from the mirror image of every sample; for methods without an estimator, whose
     inputs have one."""
-    posture_teaching: tuple[float, float] = (0.0, 0.0)
-    """Control steps from which on and until when robots that stand still are taught the posture of the legs
-    that proves their target feasible, beside PPO."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
     std_legs: tuple[float, float] = (0.1, 0.1)
@@ -159,14 +156,11 @@ class Settings:
             raise TrainingError(
                 f"--push-interval {least:g} {most:g}: valid: 0 < least <= most, or 0 0 for the protocol's"
             )
-        for option, (begin, end) in (
-            ("arm-teaching", self.arm_teaching),
-            ("posture-teaching", self.posture_teaching),
-        ):
-            if not 0.0 <= begin <= end:
-                raise TrainingError(
-                    f"--{option} {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
-                )
+        begin, end = self.arm_teaching
+        if not 0.0 <= begin <= end:
+            raise TrainingError(
+                f"--arm-teaching {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
+            )
         if self.mirror and METHODS[self.method].estimator not in ("none", "oracle"):
             valid = ", ".join(name for name, m in METHODS.items() if m.estimator in ("none", "oracle"))
             raise TrainingError(

@@ -28,8 +28,7 @@ ARM_RATE = 3e-4  # of Adam, throughout; choice
 BLEND = 0.3  # of the way from the policy's arm to the taught one, an iteration; choice
 REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
 SETS_OUT, ARRIVES = 2.0, 0.5  # of the task-progress reference, while the arm leaves its default; choice
-LEG_RATE, LEG_BLEND = 5e-5, 0.02  # the same of the legs, which PPO has to balance meanwhile; choice
-LEGS, ARM = slice(NUM_LEG_JOINTS), slice(NUM_LEG_JOINTS, NUM_JOINTS)
+ARM = slice(NUM_LEG_JOINTS, NUM_JOINTS)
 GRAVITY, JOINT_POS, REFERENCE = (
     columns(OBSERVATION_LAYOUT, term) for term in ("projected gravity", "joint positions", "task-progress")
 )
@@ -103,7 +102,7 @@ class ArmTeaching:
         q, command = self._default + seen[:, JOINT_POS][:, ARM], seen[:, OBSERVATION:][:, :COMMAND]
         there = self._arm.solve(q, command)
         miss = torch.linalg.vector_norm(self._arm.hand(there)[0] - command[:, :3], dim=-1)
-        way = way_to_go(seen)
+        way = ((SETS_OUT - seen[:, REFERENCE]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
         weight = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp
         return (way * (there - self._default) + weight) / self._scale, miss < REACHED
 
@@ -120,39 +119,3 @@ class ArmTeaching:
         wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
         self.fit.update(flat, wanted, ARM_RATE, epochs=1)
         return {"arm_teaching": float(miss.square().mean().sqrt())}
-
-
-class PostureTeaching:
-    """The legs, from the posture that proves a target feasible, while the robot stands still.
-
-    Their commands move by a part of what the measured posture lacks: whatever torque it takes, where the
-    posture is reached nothing is asked for any more. How to stay up on the way is left to PPO.
-    """
-
-    def __init__(self, actor: MLPModel, action_scale: Tensor) -> None:
-        """action_scale (14,) [rad]."""
-        self._actor, self.fit, self._scale = actor, Fit(actor, action_scale), action_scale[LEGS]
-
-    @torch.no_grad()
-    def lack(self, observations: TensorDict) -> Tensor:
-        """[rad] (M, 8) that the legs lack of the posture on the way to the target."""
-        seen = observations["critic"]
-        return way_to_go(seen) * observations["posture"] - seen[:, JOINT_POS][:, LEGS]
-
-    def update(self, observations: TensorDict) -> dict[str, float]:
-        """Learn from the states of a rollout (T, N); the root mean square lack [rad]."""
-        flat = observations.flatten(0, 1)
-        flat = flat[flat["still"][:, 0] > 0]
-        if len(flat) == 0:
-            return {}
-        lack = self.lack(flat)
-        with torch.no_grad():
-            wanted = self._actor(flat).clone()
-        wanted[:, LEGS] += LEG_BLEND * lack / self._scale
-        self.fit.update(flat, wanted, LEG_RATE, epochs=1)
-        return {"posture_teaching": float(lack.square().mean().sqrt())}
-
-
-def way_to_go(critic: Tensor) -> Tensor:
-    """Part (M, 1) of the way to the target that is due by the reference, of what the critic sees (M, 147)."""
-    return ((SETS_OUT - critic[:, REFERENCE]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
