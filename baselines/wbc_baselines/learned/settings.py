@@ -24,21 +24,21 @@ class Settings:
     """Control steps to train on, over all environments."""
     protocol: str = "ablation_v1"
     """Whose targets, randomisation, noise, pushes and terminations are trained on."""
-    envs: int = 1024
+    envs: int = 768
     """Environments side by side."""
     steps: int = 24
     """Control steps of a rollout."""
-    epochs: int = 2
+    epochs: int = 3
     """Passes of PPO over a rollout."""
     minibatches: int = 4
     """Parts of a rollout in one pass."""
-    learning_rate: float = 7e-5
+    learning_rate: float = 5e-5
     """Of the policy at the start; then adapted to `desired_kl`."""
-    least_learning_rate: float = 3e-5
+    least_learning_rate: float = 2e-5
     """Below which it is not adapted."""
     critic_learning_rate: float = 5e-4
     """Of the critic, throughout."""
-    desired_kl: float = 0.02
+    desired_kl: float = 0.015
     """KL divergence of an update that the learning rate aims at."""
     gamma: float = 0.99
     """Discount of a control step."""
@@ -57,7 +57,7 @@ class Settings:
     before any update of the policy."""
     teacher: str = "oracle@0"
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 1.9e6
+    teacher_steps: float = 1.5e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
     arm_teaching: tuple[float, float] = (0.0, 0.0)
@@ -67,11 +67,11 @@ class Settings:
     inputs have one."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: tuple[float, float] = (0.1, 0.1)
+    std_legs: tuple[float, float] = (0.1, 0.08)
     """Standard deviation of the leg actions at the start and in the end."""
-    std_arm: tuple[float, float] = (0.1, 0.1)
+    std_arm: tuple[float, float] = (0.1, 0.08)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: float = 30e6
+    std_steps: float = 7e6
     """Control steps over which they fall, exponentially."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
