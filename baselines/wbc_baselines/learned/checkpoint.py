@@ -225,8 +225,8 @@ def load_start(name: str, estimator: str) -> Checkpoint:
     Raises: CheckpointError, its estimator is a third one; and see `load`.
     """
     found = load(find(name))
-    theirs = METHODS[found.card.method].estimator
-    if theirs not in ("none", "oracle", estimator):
+    theirs = METHODS[found.card.method]
+    if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(
             f"--start '{name}' is of {found.card.method}, valid: a method without a context, the oracle, "
             f"or a method with the estimator '{estimator}'"

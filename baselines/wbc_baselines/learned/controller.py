@@ -109,7 +109,7 @@ class LearnedController:
         Raises: CheckpointError, the method has no estimator or the policy is an exported one.
         """
         if self._latent is None:
-            shown = ", ".join(name for name in METHODS if name not in ("no_latent", "oracle"))
+            shown = ", ".join(name for name, method in METHODS.items() if method.estimates)
             raise CheckpointError(
                 f"'{self.info.name}' shows no latent; valid: checkpoints (`learned:`) of {shown}"
             )

@@ -15,6 +15,11 @@ class Method(NamedTuple):
     label: str  # as the paper's table calls it
 
     @property
+    def estimates(self) -> bool:
+        """Whether its context is estimated: not of the method without one, nor of the oracle."""
+        return self.estimator not in ("none", "oracle")
+
+    @property
     def signals(self) -> frozenset[Signal]:
         """What the policy reads in an evaluation; the oracle alone reads more than the paper's policy may."""
         privileged: frozenset[Signal] = frozenset({"base_pose", "privileged"})

@@ -161,8 +161,8 @@ class Settings:
             raise TrainingError(
                 f"--arm-teaching {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
             )
-        if self.mirror and METHODS[self.method].estimator not in ("none", "oracle"):
-            valid = ", ".join(name for name, m in METHODS.items() if m.estimator in ("none", "oracle"))
+        if self.mirror and METHODS[self.method].estimates:
+            valid = ", ".join(name for name, method in METHODS.items() if not method.estimates)
             raise TrainingError(
                 f"--mirror with --method {self.method}: valid: {valid}, which estimate nothing"
             )

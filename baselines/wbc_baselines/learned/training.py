@@ -213,8 +213,8 @@ class Trainer:
             "policy": input_mirror(robot),
             "critic": critic_mirror(robot),
             "context": privileged_mirror(robot),
+            "action": joint_mirror(robot),
         }
-        mirrors["action"] = joint_mirror(robot)
         images = {
             name: (torch.from_numpy(m.place).to(self.device), torch.from_numpy(m.sign).to(self.device))
             for name, m in mirrors.items()

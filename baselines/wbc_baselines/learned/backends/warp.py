@@ -65,10 +65,8 @@ class WarpBackend:
         self._default_q, self._kp, self._kd, self._effort = (
             self._tensor(a) for a in (robot.default_q, robot.kp, robot.kd, robot.effort)
         )
-        self._mass, self._inertia = (
-            float(model.body_mass[self._base]),
-            self._tensor(model.body_inertia[self._base]),
-        )
+        self._mass = float(model.body_mass[self._base])
+        self._inertia = self._tensor(model.body_inertia[self._base])
         self._gain, self._bias = self._tensor(model.actuator_gainprm), self._tensor(model.actuator_biasprm)
         spread = protocol.randomization.base_mass
         self._lightest, self._span = spread[0], max(spread[1] - spread[0], 1e-9)
@@ -110,7 +108,7 @@ class WarpBackend:
                 with wp.ScopedCapture() as capture:
                     work()
             self._graphs[work] = capture.graph
-            self._restore(before)
+            self.load(before)
             torch.cuda.synchronize(self.device)
         # on torch's stream, so that neither library reads what the other is still writing
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
@@ -183,9 +181,6 @@ class WarpBackend:
         return {name: array.cpu().numpy().copy() for name, array in (self._state | self._fields).items()}
 
     def load(self, saved: dict[str, NDArray]) -> None:
-        self._restore(saved)
-
-    def _restore(self, saved: dict[str, NDArray]) -> None:
         for name, array in (self._state | self._fields).items():
             array.copy_(torch.from_numpy(saved[name]))
 
