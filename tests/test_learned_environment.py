@@ -231,8 +231,8 @@ def test_a_push_comes_at_its_step():
     with_push._episode.push_step[2, 0] = with_push._episode.step[2]
     with_push._episode.push_vel[2, 0] = torch.tensor([0.4, -0.2])
     moved = []
-    for env in (with_push, without):
-        env.step(torch.zeros(N, 14))
+    for env, expected in ((with_push, [2]), (without, [])):
+        assert env.step(torch.zeros(N, 14)).pushed.nonzero()[:, 0].tolist() == expected
         moved.append(env._state.qpos[:, :2].clone())
     difference = (moved[0] - moved[1]).abs().sum(-1)
     assert difference[2] > 1e-3

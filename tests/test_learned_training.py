@@ -29,7 +29,7 @@ from wbc_baselines.learned.methods import METHODS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder, run  # noqa: E402
 from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
 from wbc_baselines.learned.starts import draw_starts  # noqa: E402
-from wbc_baselines.learned.training import Trainer, make_environment  # noqa: E402
+from wbc_baselines.learned.training import Trainer, advantages, make_environment  # noqa: E402
 from wbc_bench.controller import load_controller  # noqa: E402
 from wbc_bench.errors import UnknownNameError  # noqa: E402
 from wbc_bench.protocol import Noise, Push, find_protocol  # noqa: E402
@@ -454,3 +454,34 @@ def test_the_command_line(tmp_path, capsys):
         main(["run", "--method", "oracel", *options])
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and "oracle" in error and error.count("\n") == 1
+
+
+def test_advantages_by_hand():
+    """Sums of discounted surprises, that end with an episode, and before a push."""
+    rewards = torch.tensor([[1.0], [2.0], [3.0]])
+    values = torch.tensor([[10.0], [20.0], [30.0], [40.0]])
+    no = torch.zeros(3, 1, dtype=torch.bool)
+    # surprises with gamma 0.5: 1 + 10 - 10 = 1, 2 + 15 - 20 = -3, 3 + 20 - 30 = -7; factor 0.5 * 0.8 = 0.4
+    found = advantages(rewards, values, no, no, 0.5, 0.8)
+    assert found[:, 0].tolist() == pytest.approx([1 + 0.4 * (-3 + 0.4 * -7), -3 + 0.4 * -7, -7])
+    done = torch.tensor([[False], [True], [False]])  # at 1: 2 - 20 = -18, and nothing from 2 on
+    assert advantages(rewards, values, done, no, 0.5, 0.8)[:, 0].tolist() == pytest.approx(
+        [1 + 0.4 * -18, -18, -7]
+    )
+    pushed = torch.tensor([[False], [True], [False]])
+    assert advantages(rewards, values, no, pushed, 0.5, 0.8)[:, 0].tolist() == pytest.approx([1, 0, -7])
+
+
+def test_advantages_without_pushes_are_rsl_rls():
+    """A second implementation: with one lambda and no push the two agree; the critic's targets always do."""
+    one = trainer(push_interval=(50.0, 60.0), policy_lam=0.95)
+    ends = trainer(push_interval=(50.0, 60.0), policy_lam=0.5)
+    for each in (one, ends):
+        torch.manual_seed(0)
+        each.environment.begin_rollout(0, each.settings.steps)
+        each._judge(each._roll_out()[1])
+    storage = one.ppo.storage
+    expected = storage.returns - storage.values
+    torch.testing.assert_close(storage.advantages, (expected - expected.mean()) / (expected.std() + 1e-8))
+    torch.testing.assert_close(ends.ppo.storage.returns, storage.returns)
+    assert (ends.ppo.storage.advantages - storage.advantages).abs().max() > 1e-2

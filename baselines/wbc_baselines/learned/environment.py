@@ -77,6 +77,7 @@ class Step(NamedTuple):
     reward: Tensor  # (N,)
     done: Tensor  # (N,) bool
     time_out: Tensor  # (N,) bool: done, and not by a fault of the policy
+    pushed: Tensor  # (N,) bool: a push came before it
 
 
 class _Bank(NamedTuple):
@@ -217,8 +218,8 @@ class Environment:
     def step(self, action: Tensor) -> Step:
         """Apply normalised actions (N, 14) for one control period."""
         protocol, episode, before = self.protocol, self._episode, self._state
-        now = (episode.push_step == episode.step[:, None])[..., None]
-        self._backend.push((episode.push_vel * now).sum(1))
+        now = episode.push_step == episode.step[:, None]
+        self._backend.push((episode.push_vel * now[..., None]).sum(1))
         state = self._backend.step(self._default_q + self._scale * action)
         state = state.where_sound(before)
         view = self._derive(state, before, episode)
@@ -245,7 +246,7 @@ class Environment:
         self._reset(done)
         self.seen = self._see()
         self._at += 1
-        return Step(self.seen, reward, done, time_out)
+        return Step(self.seen, reward, done, time_out, now.any(1))
 
     def _derive(self, state: State, before: State, episode: Episode) -> View:
         rate = 1 / self.protocol.control_period  # [1/s]

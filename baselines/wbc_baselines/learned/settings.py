@@ -43,7 +43,9 @@ class Settings:
     gamma: float = 0.99
     """Discount of a control step."""
     lam: float = 0.95
-    """Lambda of the generalised advantage estimate."""
+    """Lambda of the critic's targets."""
+    policy_lam: float = 0.95
+    """Lambda of the policy's advantages. The better the critic, the less is gained by looking further."""
     clip: float = 0.2
     """PPO's clip."""
     gradient_norm: float = 1.0
