@@ -32,19 +32,19 @@ class Settings:
     """Passes of PPO over a rollout."""
     minibatches: int = 4
     """Parts of a rollout in one pass."""
-    learning_rate: float = 5e-5
+    learning_rate: float = 1e-4
     """Of the policy at the start; then adapted to `desired_kl`."""
     least_learning_rate: float = 2e-5
     """Below which it is not adapted."""
     critic_learning_rate: float = 5e-4
     """Of the critic, throughout."""
-    desired_kl: float = 0.015
+    desired_kl: float = 0.03
     """KL divergence of an update that the learning rate aims at."""
     gamma: float = 0.99
     """Discount of a control step."""
     lam: float = 0.95
     """Lambda of the critic's targets."""
-    policy_lam: float = 0.95
+    policy_lam: float = 0.8
     """Lambda of the policy's advantages. The better the critic, the less is gained by looking further."""
     clip: float = 0.2
     """PPO's clip."""
@@ -59,22 +59,23 @@ class Settings:
     before any update of the policy."""
     teacher: str = "oracle@0"
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 1.5e6
+    teacher_steps: float = 1.2e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
-    arm_teaching: tuple[float, float] = (0.0, 0.0)
+    arm_teaching: tuple[float, float] = (1.2e6, 100e6)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
     mirror: bool = False
     """Whether PPO also learns from the mirror image of every sample; for methods without an estimator, whose
     inputs have one."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: tuple[float, float] = (0.1, 0.08)
-    """Standard deviation of the leg actions at the start and in the end."""
-    std_arm: tuple[float, float] = (0.1, 0.08)
+    std_legs: tuple[float, float] = (0.27, 0.1)
+    """Standard deviation of the leg actions at the start and in the end. Who learns at 0.14 stands still and
+    falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
+    std_arm: tuple[float, float] = (0.4, 0.1)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: float = 7e6
-    """Control steps over which they fall, exponentially."""
+    std_steps: tuple[float, float] = (2.8e6, 4.2e6)
+    """Control steps from which on and until when they fall, exponentially."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
     decimation: int = 2
@@ -84,7 +85,7 @@ class Settings:
     calm: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when noise, pushes and randomisation rise from none to the
     protocol's; 0 0 for all from the first step on: who learns to stand undisturbed does not learn to step."""
-    push_interval: tuple[float, float] = (0.0, 0.0)
+    push_interval: tuple[float, float] = (1.5, 3.0)
     """[s] between two pushes, least and most; 0 0 for the protocol's. Most steps of an episode show a robot
     that stands: with more pushes more of them show how to stay up."""
     estimator_share: float = 0.125
@@ -112,7 +113,8 @@ class Settings:
 
     def std(self, samples: int) -> tuple[float, float]:
         """Standard deviations of leg and arm actions after so many control steps."""
-        way = min(1.0, samples / self.std_steps)
+        begin, end = self.std_steps
+        way = min(1.0, max(0.0, (samples - begin) / (end - begin)))
         legs, arm = (first * (last / first) ** way for first, last in (self.std_legs, self.std_arm))
         return legs, arm
 
@@ -143,13 +145,15 @@ class Settings:
                 option = name.replace("_", "-")
                 raise TrainingError(f"--{option} {getattr(self, name)}: valid: 1 or more")
         for option, values in (
-            ("std-steps", (self.std_steps,)),
             ("teacher-steps", (self.teacher_steps,)),
             ("std-legs", self.std_legs),
             ("std-arm", self.std_arm),
         ):
             if not min(values) > 0:
                 raise TrainingError(f"--{option} {' '.join(map(str, values))}: valid: more than 0")
+        begin, end = self.std_steps
+        if not 0.0 <= begin < end:
+            raise TrainingError(f"--std-steps {begin:g} {end:g}: valid: 0 <= begin < end")
         begin, end = self.calm
         if not (0.0 <= begin < end or begin == end == 0.0):
             raise TrainingError(f"--calm {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for never")
