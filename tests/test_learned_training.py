@@ -136,7 +136,7 @@ def test_the_policys_gradient_never_reaches_the_estimator():
     t = trainer(method="transformer_gru")
     weights = {name: value.clone() for name, value in t.estimator.state_dict().items()}
     t.environment.begin_rollout(0, TINY.steps)
-    rollout = t._roll_out()
+    rollout = t._roll_out()[0]
     assert rollout
     assert not t.ppo.storage.observations["context"].requires_grad
     with torch.no_grad():
@@ -170,7 +170,7 @@ def test_the_rollout_gives_the_contexts_back(method, monkeypatch):
     for _ in range(2):  # the second rollout begins in the middle of episodes
         contexts.clear()
         t.environment.begin_rollout(t.iteration, TINY.steps)
-        rollout = t._roll_out()
+        rollout = t._roll_out()[0]
         assert rollout and isinstance(t.estimator, LatentEstimator)
         t.iteration += 1
         t.ppo.storage.clear()
@@ -186,7 +186,7 @@ def test_the_next_observation_is_of_the_next_step():
     t = trainer(method="cenet")
     t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor([2, 4, *[100] * 6])
     t.environment.begin_rollout(0, TINY.steps)
-    rollout = t._roll_out()
+    rollout = t._roll_out()[0]
     assert rollout
     (batch,) = rollout.batches(1)
     # columns shared by the noisy term and the clean observation, up to the noise

@@ -74,7 +74,7 @@ class Settings:
     falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
     std_arm: tuple[float, float] = (0.4, 0.1)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: tuple[float, float] = (2.8e6, 4.2e6)
+    std_steps: tuple[float, float] = (2.4e6, 3.6e6)
     """Control steps from which on and until when they fall, exponentially."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
