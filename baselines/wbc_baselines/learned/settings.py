@@ -74,8 +74,8 @@ class Settings:
     falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
     std_arm: tuple[float, float] = (0.4, 0.1)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: tuple[float, float] = (2.4e6, 3.6e6)
-    """Control steps from which on and until when they fall, exponentially."""
+    std_steps: tuple[float, float] = (50e6, 60e6)
+    """Control steps from which on and until when they fall, exponentially: the last part of the budget."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
     decimation: int = 2

@@ -1,8 +1,9 @@
 """PPO on the environment, the estimator beside it on its own losses.
 
-rsl-rl-lib's PPO is used as it is: the context enters as an observation group, written at rollout time without
-a gradient, so no update of the policy can reach the estimator. All randomness of an iteration comes from the
-seed and the iteration's number, so between two iterations no generator has a state worth keeping.
+rsl-rl-lib's PPO is used as it is, but for the advantages, which are written over its own: they end before a
+push. The context enters as an observation group, written at rollout time without a gradient, so no update of
+the policy can reach the estimator. All randomness of an iteration comes from the seed and the iteration's
+number, so between two iterations no generator has a state worth keeping.
 """
 
 import math
