@@ -113,23 +113,21 @@ class Settings:
 
     def std(self, samples: int) -> tuple[float, float]:
         """Standard deviations of leg and arm actions after so many control steps."""
-        begin, end = self.std_steps
-        way = min(1.0, max(0.0, (samples - begin) / (end - begin)))
+        way = _way(samples, *self.std_steps)
         legs, arm = (first * (last / first) ** way for first, last in (self.std_legs, self.std_arm))
         return legs, arm
 
     def severity(self, samples: int) -> float:
         """Of the disturbances, in [0, 1], after so many control steps."""
-        begin, end = self.calm
-        return max(0.0, (samples - begin) / (end - begin)) if samples < end else 1.0
+        return _way(samples, *self.calm)
 
     def taught(self, samples: int) -> float:
         """Part of the teacher's time that is over, in [0, 1], after so many control steps; 1 without one."""
-        return min(1.0, samples / self.teacher_steps) if self.teacher else 1.0
+        return _way(samples, 0.0, self.teacher_steps) if self.teacher else 1.0
 
     def ramp(self, samples: int) -> float:
         """Part of the curriculum that is done, in [0, 1], after so many control steps."""
-        return samples / self.curriculum if samples < self.curriculum else 1.0
+        return _way(samples, 0.0, self.curriculum)
 
     def check(self) -> None:
         """Refuse what cannot be run.
@@ -186,3 +184,8 @@ class Settings:
     def estimator_envs(self) -> int:
         """Environments whose rollouts train the estimator."""
         return max(1, round(self.envs * self.estimator_share))
+
+
+def _way(samples: float, begin: float, end: float) -> float:
+    """Part of the way from `begin` to `end` that is done, in [0, 1]; all of it where there is none."""
+    return max(0.0, (samples - begin) / (end - begin)) if samples < end else 1.0

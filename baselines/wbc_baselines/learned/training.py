@@ -134,7 +134,7 @@ class Trainer:
                     if name.endswith("normalizer.count"):
                         count.fill_(settings.start_samples)
         self._privileged = self.method.estimator == "oracle"
-        self._estimates = self.estimator.context_dim > 0 and not self._privileged
+        self._estimates = self.method.estimates
         seen = environment.seen
         self._history = History(seen.term)
         self._state = torch.zeros(environment.num_envs, self.estimator.state_dim, device=self.device)
