@@ -9,12 +9,20 @@ pytest.importorskip("rsl_rl")
 from learned import write  # noqa: E402
 from test_learned_training import TINY, assert_equal, trainer  # noqa: E402
 
-from wbc_baselines.learned import checkpoint, runs  # noqa: E402
+from wbc_baselines.learned import checkpoint, runs, teaching  # noqa: E402
 from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
 from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder  # noqa: E402
 from wbc_baselines.learned.settings import TrainingError  # noqa: E402
-from wbc_baselines.learned.teaching import ARRIVES, BLEND, SETS_OUT, ArmTeaching, Teaching  # noqa: E402
+from wbc_baselines.learned.teaching import (  # noqa: E402
+    ARRIVES,
+    BLEND,
+    SETS_OUT,
+    SHARE,
+    ArmTeaching,
+    Fit,
+    Teaching,
+)
 from wbc_baselines.learned.training import Trainer  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
@@ -85,9 +93,45 @@ def test_returns_do_not_touch_the_policy_while_it_is_taught(tmp_path, monkeypatc
     assert not any(map(torch.equal, critic, t.ppo.critic.parameters()))
 
 
+def test_then_it_advises_beside_returns_less_and_less(tmp_path, monkeypatch):
+    changes = {"teacher_steps": STEPS, "advice_steps": 3 * STEPS}
+    t, teaching = taught(teacher=str(write(tmp_path, "no_latent")), **changes)
+    weights = []
+    monkeypatch.setattr(teaching, "advise", lambda seen, weight: weights.append(weight) or {})
+    epochs = []
+    update = t.ppo.update
+    monkeypatch.setattr(t.ppo, "update", lambda: epochs.append(t.ppo.num_learning_epochs) or update())
+    for _ in range(4):
+        t.iterate()
+    assert weights == [1.0, 0.5]
+    assert epochs == [1] + 3 * [t.settings.epochs]
+    assert t.settings.advice(0) == 1.0 and trainer(advice_steps=1e6).settings.advice(0) == 0.0
+
+
+def test_an_advice_moves_a_share_of_the_answers_a_part_of_the_way(tmp_path, monkeypatch):
+    t, teaching = taught(teacher=str(write(tmp_path, "no_latent")))
+    t.environment.begin_rollout(0, TINY.steps)
+    t._roll_out()
+    seen = t.ppo.storage.observations.flatten(0, 1)
+    own, answer = t.ppo.actor(seen).detach(), teaching.answer(seen)
+    lessons = []
+
+    def keep(self, seen, action, *a, **k) -> float:
+        lessons.append((seen["policy"], action))
+        return 0.0
+
+    monkeypatch.setattr(Fit, "update", keep)
+    teaching.advise(t.ppo.storage.observations, 0.5)
+    states, wanted = lessons[0]
+    assert len(states) == round(SHARE * STEPS)
+    row = torch.cdist(states, seen["policy"]).argmin(-1)  # which state of the rollout each is
+    assert len(row.unique()) == len(row) and not torch.equal(row, row.sort().values)
+    torch.testing.assert_close(wanted, own[row] + 0.5 * BLEND * (answer[row] - own[row]))
+
+
 def test_a_taught_run_resumes_bit_by_bit(tmp_path):
     changes = {"teacher": str(write(tmp_path, "oracle")), "teacher_steps": 3 * STEPS, "method": "gru"}
-    changes |= {"arm_teaching": (STEPS, 4 * STEPS)}
+    changes |= {"arm_teaching": (STEPS, 4 * STEPS), "advice_steps": 6 * STEPS}
     unbroken, broken = trainer(**changes), trainer(**changes)
     folder = RunFolder(tmp_path / "gru@0")
     folder.open(broken.settings)
@@ -131,20 +175,21 @@ def test_the_arm_sets_out_as_the_reference_falls_and_bears_its_weight():
 
 
 def test_a_lesson_moves_the_arm_a_part_of_the_way_where_it_reaches_and_leaves_the_legs(monkeypatch):
-    t, teaching = arm_taught()
+    t, arm = arm_taught()
     t.environment.begin_rollout(0, TINY.steps)
     t._roll_out()
     t.ppo.storage.observations["critic"][0, :, 58] = 3.0  # [m] ahead
     seen = t.ppo.storage.observations.flatten(0, 1)
-    own, (answer, reached) = t.ppo.actor(seen).detach(), teaching.answer(seen)
+    own, (answer, reached) = t.ppo.actor(seen).detach(), arm.answer(seen)
     assert not reached[: TINY.envs].any() and reached.any()
+    monkeypatch.setattr(teaching, "_some", lambda seen: seen.flatten(0, 1))
     lessons = []
-    monkeypatch.setattr(teaching.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
-    teaching.update(t.ppo.storage.observations)
+    monkeypatch.setattr(arm.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
+    arm.update(t.ppo.storage.observations)
     torch.testing.assert_close(lessons[0][:, :8], own[reached, :8])
     torch.testing.assert_close(lessons[0][:, 8:], (own[:, 8:] + BLEND * (answer - own[:, 8:]))[reached])
     t.ppo.storage.observations["critic"][..., 58] = 3.0
-    assert teaching.update(t.ppo.storage.observations) == {} and len(lessons) == 1
+    assert arm.update(t.ppo.storage.observations) == {} and len(lessons) == 1
 
 
 def test_the_arm_is_taught_beside_ppo_while_it_is_time():

@@ -62,6 +62,8 @@ class Settings:
     teacher_steps: float = 1.2e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
+    advice_steps: float = 0.0
+    """Control steps until which it then advises beside PPO, less and less; 0 for never."""
     arm_teaching: tuple[float, float] = (1.2e6, 100e6)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
     mirror: bool = False
@@ -124,6 +126,10 @@ class Settings:
     def taught(self, samples: int) -> float:
         """Part of the teacher's time that is over, in [0, 1], after so many control steps; 1 without one."""
         return _way(samples, 0.0, self.teacher_steps) if self.teacher else 1.0
+
+    def advice(self, samples: int) -> float:
+        """Weight of the teacher's advice beside PPO, in [0, 1], after so many control steps."""
+        return 1.0 - _way(samples, self.teacher_steps, self.advice_steps) if self.teacher else 0.0
 
     def ramp(self, samples: int) -> float:
         """Part of the curriculum that is done, in [0, 1], after so many control steps."""

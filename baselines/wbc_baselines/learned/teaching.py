@@ -1,9 +1,10 @@
 """A policy that learns from teachers beside it, in the states that its own rollouts meet.
 
 What is known need not be found out by reinforcement. A teacher answers in every state of a rollout and the
-policy is fitted to the answers: a checkpoint that knows more (DAgger; PPO then takes over), or geometry for
-the joints of the arm alone, while PPO teaches the legs to carry it. Source: Ross, Gordon, Bagnell 2011, "A
-reduction of imitation learning and structured prediction to no-regret online learning".
+policy is fitted to the answers: a checkpoint that knows more (alone at first, then beside PPO, less and
+less), or geometry for the joints of the arm alone, while PPO teaches the legs to carry it. Source: Ross,
+Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret online
+learning"; Schmitt et al. 2018, "Kickstarting deep reinforcement learning", for a teacher that fades.
 """
 
 import math
@@ -24,8 +25,9 @@ from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 PARTS = 18  # of a rollout's lessons, an update each; choice, 1024 lessons a part of 768 x 24
 EPOCHS = 4  # over the lessons of a rollout; choice
 RATE, LEAST_RATE = 5e-4, 2e-5  # of Adam, first and last; choice
-ARM_RATE = 3e-4  # of Adam, throughout; choice
-BLEND = 0.3  # of the way from the policy's arm to the taught one, an iteration; choice
+BESIDE_RATE = 3e-4  # of Adam, of lessons beside PPO; choice
+BLEND = 0.3  # of the way from the policy's answer to the taught one, an iteration beside PPO; choice
+SHARE = 0.25  # of a rollout's states that are lessons beside PPO; choice: geometry costs as much as physics
 REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
 SETS_OUT, ARRIVES = 2.0, 0.5  # of the task-progress reference, while the arm leaves its default; choice
 ARM = slice(NUM_LEG_JOINTS, NUM_JOINTS)
@@ -57,12 +59,19 @@ class Fit:
         return float(torch.stack(losses).mean())
 
 
+def _some(observations: TensorDict) -> TensorDict:
+    """A share (M,) of the states of a rollout (T, N)."""
+    flat = observations.flatten(0, 1)
+    return flat[torch.randperm(len(flat), device=flat.device)[: math.ceil(SHARE * len(flat))]]
+
+
 class Teaching:
     """All joints, from a checkpoint."""
 
     def __init__(self, teacher: Checkpoint, actor: MLPModel, action_scale: Tensor) -> None:
         """action_scale (14,) [rad]."""
-        self._teacher, self.fit = teacher.actor.to(action_scale.device), Fit(actor, action_scale)
+        self._actor, self.fit = actor, Fit(actor, action_scale)
+        self._teacher = teacher.actor.to(action_scale.device)
         self._privileged = teacher.estimator.context_dim > 0
 
     @torch.no_grad()
@@ -78,6 +87,14 @@ class Teaching:
         rate = LEAST_RATE + (RATE - LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * way))
         flat = observations.flatten(0, 1)
         return {"teaching": self.fit.update(flat, self.answer(flat), rate, epochs=EPOCHS)}
+
+    def advise(self, observations: TensorDict, weight: float) -> dict[str, float]:
+        """Learn beside PPO from a share of the states of a rollout (T, N), with a weight in [0, 1]."""
+        flat = _some(observations)
+        with torch.no_grad():
+            own = self._actor(flat).clone()
+        wanted = own + BLEND * weight * (self.answer(flat) - own)
+        return {"advice": self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)}
 
 
 class ArmTeaching:
@@ -107,8 +124,8 @@ class ArmTeaching:
         return (way * (there - self._default) + weight) / self._scale, miss < REACHED
 
     def update(self, observations: TensorDict) -> dict[str, float]:
-        """Learn from the states of a rollout (T, N); the root mean square miss [rad] before."""
-        flat = observations.flatten(0, 1)
+        """Learn from a share of the states of a rollout (T, N); the root mean square miss [rad] before."""
+        flat = _some(observations)
         answer, reached = self.answer(flat)
         if not reached.any():
             return {}
@@ -117,5 +134,5 @@ class ArmTeaching:
             wanted = self._actor(flat).clone()
         miss = self._scale * (answer - wanted[:, ARM])
         wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
-        self.fit.update(flat, wanted, ARM_RATE, epochs=1)
+        self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)
         return {"arm_teaching": float(miss.square().mean().sqrt())}

@@ -263,9 +263,12 @@ class Trainer:
         rollout, pushed = self._roll_out()
         clock.append(time.perf_counter())
         self._judge(pushed)
+        ppo.num_learning_epochs = settings.epochs if self._taught == 1 else 1  # the critic's alone
         losses = ppo.update()
         if self.teaching and self._taught < 1:
             losses |= self.teaching.update(ppo.storage.observations, self._taught)
+        elif self.teaching and (weight := settings.advice(self.samples)):
+            losses |= self.teaching.advise(ppo.storage.observations, weight)
         begin, end = settings.arm_teaching
         if self.arm_teaching and begin <= self.samples < end:
             losses |= self.arm_teaching.update(ppo.storage.observations)
