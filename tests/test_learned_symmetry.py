@@ -41,7 +41,12 @@ def one_target(side: float) -> Environment:
     quat = np.array([[w, side * x, y, side * z]], np.float32)
     pos = np.array([[0.4, 0.25 * side, 0.9]], np.float32)
     quat = (quat / np.linalg.norm(quat)).astype(np.float32)
-    pool = TargetPool(np.arange(3, dtype=np.int8), np.tile(pos, (3, 1)), np.tile(quat, (3, 1)))
+    pool = TargetPool(
+        np.arange(3, dtype=np.int8),
+        np.tile(pos, (3, 1)),
+        np.tile(quat, (3, 1)),
+        np.empty((3, 21), np.float32),
+    )
     protocol = coarse()
     return Environment(protocol, CpuBackend(protocol, 2, 1), pool, "gated", 0, severity=0.0)
 

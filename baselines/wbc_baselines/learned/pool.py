@@ -35,6 +35,7 @@ class TargetPool(NamedTuple):
     stratum: NDArray[np.int8]  # (M,) index into STRATA
     pos_w: NDArray[np.float32]  # (M, 3) [m]
     quat_w: NDArray[np.float32]  # (M, 4) wxyz
+    witness_qpos: NDArray[np.float32]  # (M, 21) a posture that reaches it: base [m], wxyz, joints [rad]
 
     def __len__(self) -> int:
         return len(self.stratum)
@@ -61,25 +62,25 @@ def draw_pool(
         protocol, episodes=msgspec.structs.replace(protocol.episodes, seed=seed)
     )
 
-    def work(start: int) -> list[tuple[int, NDArray, NDArray]]:
+    def work(start: int) -> list[tuple]:
         draws = [draw_workspace_target(shifted, 0, k) for k in range(start, min(start + CHUNK, count))]
-        return [(STRATA.index(draw.stratum), draw.pos_w, draw.quat_w) for draw in draws]
+        return [(STRATA.index(d.stratum), d.pos_w, d.quat_w, d.witness_qpos) for d in draws]
 
-    rows: list[tuple[int, NDArray, NDArray]] = []
+    rows: list[tuple] = []
     parts: Any = Parallel(n_jobs=workers, return_as="generator")(
         delayed(work)(start) for start in range(0, count, CHUNK)
     )
     for part in parts:
         rows.extend(part)
         progress(len(rows), count)
-    stratum, pos, quat = zip(*rows, strict=True)
-    return TargetPool(np.array(stratum, np.int8), np.array(pos, np.float32), np.array(quat, np.float32))
+    stratum, *poses = zip(*rows, strict=True)
+    return TargetPool(np.array(stratum, np.int8), *(np.array(pose, np.float32) for pose in poses))
 
 
 def write_pool(pool: TargetPool, protocol: EvalProtocol, path: Path) -> None:
     """Write a pool with the digest of what it was drawn for, at once or not at all."""
     columns = [pa.array(pool.stratum)]
-    for values in (pool.pos_w, pool.quat_w):
+    for values in pool[1:]:
         columns.append(pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1]))
     table = pa.Table.from_arrays(columns, names=list(TargetPool._fields))
     table = table.replace_schema_metadata({"protocol": protocol.name, "digest": digest(protocol)})
@@ -106,6 +107,11 @@ def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
     except (OSError, pa.ArrowException) as error:
         raise ManifestError(f"target pool '{path}' is not readable parquet: {error}") from error
     made_for = (table.schema.metadata or {}).get(b"digest", b"").decode()
+    if table.column_names != list(TargetPool._fields):
+        raise ManifestError(
+            f"target pool '{path}' has columns {', '.join(table.column_names)}, valid: "
+            f"{', '.join(TargetPool._fields)}: draw it again with `wbc-train targets`"
+        )
     if made_for != digest(protocol):
         raise ManifestError(
             f"target pool '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
@@ -116,4 +122,4 @@ def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
         column = table[name].combine_chunks()
         return column.flatten().to_numpy().reshape(len(table), -1)
 
-    return TargetPool(table["stratum"].to_numpy(), matrix("pos_w"), matrix("quat_w"))
+    return TargetPool(table["stratum"].to_numpy(), *map(matrix, TargetPool._fields[1:]))
