@@ -132,6 +132,7 @@ def test_an_advice_moves_a_share_of_the_answers_a_part_of_the_way(tmp_path, monk
 def test_a_taught_run_resumes_bit_by_bit(tmp_path):
     changes = {"teacher": str(write(tmp_path, "oracle")), "teacher_steps": 3 * STEPS, "method": "gru"}
     changes |= {"arm_teaching": (STEPS, 4 * STEPS), "advice_steps": 6 * STEPS}
+    changes |= {"posture_teaching": (0.0, 4 * STEPS), "ahead": 0.5}
     unbroken, broken = trainer(**changes), trainer(**changes)
     folder = RunFolder(tmp_path / "gru@0")
     folder.open(broken.settings)
@@ -190,6 +191,28 @@ def test_a_lesson_moves_the_arm_a_part_of_the_way_where_it_reaches_and_leaves_th
     torch.testing.assert_close(lessons[0][:, 8:], (own[:, 8:] + BLEND * (answer - own[:, 8:]))[reached])
     t.ppo.storage.observations["critic"][..., 58] = 3.0
     assert arm.update(t.ppo.storage.observations) == {} and len(lessons) == 1
+
+
+def test_legs_are_taught_a_part_of_what_they_lack(monkeypatch):
+    """A fiftieth, in actions, where there is a lack; the arm stays."""
+    t = trainer(posture_teaching=(0.0, 3 * STEPS))
+    legs = t.posture_teaching
+    assert legs
+    t.environment.begin_rollout(0, TINY.steps)
+    t._roll_out()
+    seen = t.ppo.storage.observations
+    seen["lack"][:] = 0.0
+    assert legs.update(seen) == {}
+    lack = torch.linspace(-0.5, 0.5, 16).reshape(2, 8)
+    seen["lack"][1, 2:4] = lack
+    own = t.ppo.actor(seen[1, 2:4]).detach()
+    lessons = []
+    monkeypatch.setattr(legs.fit, "update", lambda seen, action, *a, **k: lessons.append(action))
+    found = legs.update(seen)
+    scale = torch.tensor(ROBOT.action_scale[:8], dtype=torch.float32)
+    torch.testing.assert_close(lessons[0][:, :8], own[:, :8] + 0.02 * lack / scale)
+    torch.testing.assert_close(lessons[0][:, 8:], own[:, 8:])
+    assert found["posture_teaching"] == pytest.approx(float(lack.square().mean().sqrt()), rel=1e-5)
 
 
 def test_the_arm_is_taught_beside_ppo_while_it_is_time():

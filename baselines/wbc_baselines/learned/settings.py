@@ -66,6 +66,9 @@ class Settings:
     """Control steps until which it then advises beside PPO, less and less; 0 for never."""
     arm_teaching: tuple[float, float] = (1.2e6, 100e6)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
+    posture_teaching: tuple[float, float] = (0.0, 0.0)
+    """Control steps from which on and until when robots that stand still, short of a target in reach, are
+    taught a posture of the legs that reaches it, beside PPO."""
     mirror: bool = False
     """Whether PPO also learns from the mirror image of every sample; for methods without an estimator, whose
     inputs have one."""
@@ -171,11 +174,13 @@ class Settings:
             raise TrainingError(
                 f"--push-interval {least:g} {most:g}: valid: 0 < least <= most, or 0 0 for the protocol's"
             )
-        begin, end = self.arm_teaching
-        if not 0.0 <= begin <= end:
-            raise TrainingError(
-                f"--arm-teaching {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
-            )
+        for name in ("arm_teaching", "posture_teaching"):
+            begin, end = getattr(self, name)
+            if not 0.0 <= begin <= end:
+                option = name.replace("_", "-")
+                raise TrainingError(
+                    f"--{option} {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
+                )
         if self.mirror and METHODS[self.method].estimates:
             valid = ", ".join(name for name, method in METHODS.items() if not method.estimates)
             raise TrainingError(

@@ -28,9 +28,10 @@ RATE, LEAST_RATE = 5e-4, 2e-5  # of Adam, first and last; choice
 BESIDE_RATE = 3e-4  # of Adam, of lessons beside PPO; choice
 BLEND = 0.3  # of the way from the policy's answer to the taught one, an iteration beside PPO; choice
 SHARE = 0.25  # of a rollout's states that are lessons beside PPO; choice: geometry costs as much as physics
+LEG_RATE, LEG_BLEND = 5e-5, 0.02  # the same of the legs, which PPO has to balance meanwhile; choice
 REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
 SETS_OUT, ARRIVES = 2.0, 0.5  # of the task-progress reference, while the arm leaves its default; choice
-ARM = slice(NUM_LEG_JOINTS, NUM_JOINTS)
+LEGS, ARM = slice(NUM_LEG_JOINTS), slice(NUM_LEG_JOINTS, NUM_JOINTS)
 GRAVITY, JOINT_POS, REFERENCE = (
     columns(OBSERVATION_LAYOUT, term) for term in ("projected gravity", "joint positions", "task-progress")
 )
@@ -136,3 +137,28 @@ class ArmTeaching:
         wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
         self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)
         return {"arm_teaching": float(miss.square().mean().sqrt())}
+
+
+class PostureTeaching:
+    """The legs, from a posture that reaches the target, where the robot stands still and its hand is late.
+
+    Their commands move by a part of what the measured posture lacks: whatever torque it takes, where the
+    posture is reached nothing is asked for any more. How to stay up on the way is left to PPO.
+    """
+
+    def __init__(self, actor: MLPModel, action_scale: Tensor) -> None:
+        """action_scale (14,) [rad]."""
+        self._actor, self.fit, self._scale = actor, Fit(actor, action_scale), action_scale[LEGS]
+
+    def update(self, observations: TensorDict) -> dict[str, float]:
+        """Learn from the states of a rollout (T, N); the root mean square lack [rad]."""
+        flat = observations.flatten(0, 1)
+        flat = flat[flat["lack"].any(-1)]
+        if len(flat) == 0:
+            return {}
+        lack = flat["lack"]
+        with torch.no_grad():
+            wanted = self._actor(flat).clone()
+        wanted[:, LEGS] += LEG_BLEND * lack / self._scale
+        self.fit.update(flat, wanted, LEG_RATE, epochs=1)
+        return {"posture_teaching": float(lack.square().mean().sqrt())}

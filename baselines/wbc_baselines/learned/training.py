@@ -31,7 +31,7 @@ from wbc_baselines.learned.networks import HIDDEN, Actor
 from wbc_baselines.learned.pool import TargetPool, read_pool
 from wbc_baselines.learned.settings import Settings, TrainingError
 from wbc_baselines.learned.symmetry import critic_mirror, input_mirror, joint_mirror, privileged_mirror
-from wbc_baselines.learned.teaching import ArmTeaching, Fit, Teaching
+from wbc_baselines.learned.teaching import ArmTeaching, Fit, PostureTeaching, Teaching
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
@@ -143,11 +143,13 @@ class Trainer:
         self.ppo = self._make_ppo(start)
         robot = load_robot(environment.protocol.robot)
         scale = torch.tensor(robot.action_scale, dtype=torch.float32, device=self.device)
-        self.teaching = self.arm_teaching = None
+        self.teaching = self.arm_teaching = self.posture_teaching = None
         if settings.teacher:
             self.teaching = Teaching(checkpoint.load_teacher(settings.teacher), self.ppo.actor, scale)
         if settings.arm_teaching[1]:
             self.arm_teaching = ArmTeaching(robot, self.ppo.actor, scale)
+        if settings.posture_teaching[1]:
+            self.posture_teaching = PostureTeaching(self.ppo.actor, scale)
         parameters = list(self.estimator.parameters())
         self.optimizer = (
             torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
@@ -227,7 +229,7 @@ class Trainer:
 
         def augment(env: object, obs: TensorDict | None, actions: Tensor | None) -> tuple:
             if obs is not None:
-                groups = {name: both(name, obs[name]) for name in map(str, obs.keys())}
+                groups = {name: both(name, obs[name]) for name in map(str, obs.keys()) if name in images}
                 obs = TensorDict(groups, batch_size=[2 * len(obs)], device=self.device)
             return obs, None if actions is None else both("action", actions)
 
@@ -269,9 +271,12 @@ class Trainer:
             losses |= self.teaching.update(ppo.storage.observations, self._taught)
         elif self.teaching and (weight := settings.advice(self.samples)):
             losses |= self.teaching.advise(ppo.storage.observations, weight)
-        begin, end = settings.arm_teaching
-        if self.arm_teaching and begin <= self.samples < end:
-            losses |= self.arm_teaching.update(ppo.storage.observations)
+        for lessons, (begin, end) in (
+            (self.arm_teaching, settings.arm_teaching),
+            (self.posture_teaching, settings.posture_teaching),
+        ):
+            if lessons and begin <= self.samples < end:
+                losses |= lessons.update(ppo.storage.observations)
         clock.append(time.perf_counter())
         losses |= self._update_estimator(rollout) if rollout else {}
         clock.append(time.perf_counter())
@@ -362,6 +367,8 @@ class Trainer:
             groups["context"] = seen.critic[:, PRIVILEGED_COLUMNS]
         elif self._context is not None:
             groups["context"] = self._context
+        if self.settings.posture_teaching[1]:
+            groups["lack"] = seen.lack
         return TensorDict(groups, batch_size=[self.environment.num_envs], device=self.device)
 
     def _update_estimator(self, rollout: Rollout) -> dict[str, float]:
@@ -380,7 +387,8 @@ class Trainer:
         return {name: float(value) / settings.estimator_minibatches for name, value in sums.items()}
 
     def _fits(self) -> list[Fit]:
-        return [teaching.fit for teaching in (self.teaching, self.arm_teaching) if teaching]
+        all_of_them = (self.teaching, self.arm_teaching, self.posture_teaching)
+        return [teaching.fit for teaching in all_of_them if teaching]
 
     # ---- networks for an evaluation, and everything for a resume -------------------------------------------
 
