@@ -59,12 +59,12 @@ class Settings:
     before any update of the policy."""
     teacher: str = "oracle@0"
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 1.2e6
+    teacher_steps: float = 4e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
-    advice_steps: float = 0.0
+    advice_steps: float = 12e6
     """Control steps until which it then advises beside PPO, less and less; 0 for never."""
-    arm_teaching: tuple[float, float] = (1.2e6, 100e6)
+    arm_teaching: tuple[float, float] = (4e6, 100e6)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
     posture_teaching: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when robots that stand still, short of a target in reach, are
