@@ -132,7 +132,7 @@ def test_an_advice_moves_a_share_of_the_answers_a_part_of_the_way(tmp_path, monk
 def test_a_taught_run_resumes_bit_by_bit(tmp_path):
     changes = {"teacher": str(write(tmp_path, "oracle")), "teacher_steps": 3 * STEPS, "method": "gru"}
     changes |= {"arm_teaching": (STEPS, 4 * STEPS), "advice_steps": 6 * STEPS}
-    changes |= {"posture_teaching": (0.0, 4 * STEPS), "ahead": 0.5}
+    changes |= {"posture_teaching": (0.0, 4 * STEPS)}
     unbroken, broken = trainer(**changes), trainer(**changes)
     folder = RunFolder(tmp_path / "gru@0")
     folder.open(broken.settings)

@@ -97,18 +97,12 @@ def draw_pushes(push: Push, horizon: float, rng: np.random.Generator) -> tuple[A
 
 def resting_height(config: RobotConfig, leg_q: Array) -> float:
     """Height [m] of a level base whose lowest sole touches the ground, legs `leg_q` (8,) off default."""
-    default = load_robot(config).default_q
-    joints = default[:NUM_LEG_JOINTS] + leg_q, default[NUM_LEG_JOINTS:]
-    return -lowest_sole(config, np.concatenate([[0, 0, 0, 1, 0, 0, 0], *joints]))
-
-
-def lowest_sole(config: RobotConfig, qpos: Array) -> float:
-    """Height [m] above the ground of the lowest point of the soles; qpos (21,) with the base's pose."""
     model, data = _model(config)
-    data.qpos[:] = qpos
+    default = load_robot(config).default_q
+    data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *(default[:NUM_LEG_JOINTS] + leg_q), *default[NUM_LEG_JOINTS:]]
     mujoco.mj_kinematics(model, data)
     corners = [model.geom(f"foot_{side}_{k}").id for side in "LR" for k in range(4)]
-    return float((data.geom_xpos[corners, 2] - model.geom_size[corners, 0]).min())
+    return -float((data.geom_xpos[corners, 2] - model.geom_size[corners, 0]).min())
 
 
 @cache

@@ -110,13 +110,12 @@ class Environment:
         reward: Reward,
         seed: int,
         severity: float = 1.0,
-        ahead: float = 0.0,
     ) -> None:
-        """`severity`: see `starts.weakened`; `ahead`: see `starts.draw_starts`."""
+        """`severity`: see `starts.weakened`."""
         self.protocol, self.num_envs, self.device = protocol, backend.num_envs, backend.device
         self.curriculum = 1.0  # part of the ramp over strata that is done
         self.severity = severity  # of the episodes that begin and of the noise, from now on
-        self._backend, self._seed, self._ahead = backend, seed, ahead
+        self._backend, self._seed = backend, seed
         self._reward: Reward = reward
         self._robot = load_robot(protocol.robot)
         self._pool, self._body = pool, body_of(self._robot, self.device)
@@ -150,7 +149,7 @@ class Environment:
         """Draw as many episodes as there are environments, ahead of their use: one transfer to a GPU."""
         rng = stream(self._seed, "training start", bank.number)
         protocol = weakened(self.protocol, bank.severity)
-        draws = draw_starts(protocol, self._pool, self.num_envs, rng, bank.curriculum, self._ahead)
+        draws = draw_starts(protocol, self._pool, self.num_envs, rng, bank.curriculum)
         self._bank = bank
         self._starts = Start(*(column.to(self.device) for column in draws.start))
         self._episodes = self._fresh_episodes(draws)

@@ -22,7 +22,7 @@ from wbc_baselines.learned.inputs import COMMAND, OBSERVATION
 from wbc_baselines.learned.networks import Actor
 from wbc_baselines.learned.policy import flow_of
 from wbc_baselines.learned.pool import TargetPool
-from wbc_baselines.learned.starts import draw_starts, manifest_columns, weakened
+from wbc_baselines.learned.starts import draw_starts, weakened
 from wbc_baselines.learned.symmetry import input_mirror, joint_mirror
 from wbc_bench.control_loop import ControlLoop
 from wbc_bench.controller import (
@@ -185,7 +185,7 @@ def draw_rows(
         target_pos_w=pos,
         target_quat_w=pool.quat_w[chosen].astype(np.float64),
         witness_qpos=np.full((count, 21), np.nan),
-        **manifest_columns(draws.start, protocol),
+        **{name: column.numpy() for name, column in draws.start._asdict().items()},
         push_time=np.where(push_step < 0, np.nan, push_step * protocol.control_period),
         push_vel=draws.push_vel.numpy().reshape(count, -1),
         noise_key=rng.integers(2**63 - 1, size=count),

@@ -87,9 +87,6 @@ class Settings:
     """Physics steps in a control period."""
     curriculum: float = 0.0
     """Control steps over which the strata ramp from mostly `arm` to the protocol's weights."""
-    ahead: float = 0.0
-    """Share of the episodes that begin on the way to the target: in the stance that reaches it, the posture
-    anywhere between the default one and one that does."""
     calm: tuple[float, float] = (0.0, 0.0)
     """Control steps from which on and until when noise, pushes and randomisation rise from none to the
     protocol's; 0 0 for all from the first step on: who learns to stand undisturbed does not learn to step."""
@@ -164,8 +161,6 @@ class Settings:
         begin, end = self.std_steps
         if not 0.0 <= begin < end:
             raise TrainingError(f"--std-steps {begin:g} {end:g}: valid: 0 <= begin < end")
-        if not 0.0 <= self.ahead <= 1.0:
-            raise TrainingError(f"--ahead {self.ahead:g}: valid: 0 to 1")
         begin, end = self.calm
         if not (0.0 <= begin < end or begin == end == 0.0):
             raise TrainingError(f"--calm {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for never")

@@ -12,20 +12,13 @@ from wbc_baselines.learned.backends.base import Start
 from wbc_baselines.learned.pool import TargetPool
 from wbc_bench.episodes import STRATA
 from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
-from wbc_bench.randomization import lowest_sole, resting_height
+from wbc_bench.randomization import resting_height
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
 Array = NDArray[np.float64]
 DECAY = (0.5, 1.4)  # [1/s] v_ref in training. Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
 # Shares of arm, posture and step at the start of a curriculum; choice. It ends at the protocol's weights.
 FIRST_SHARES = np.array([0.6, 0.3, 0.1])
-
-
-def manifest_columns(start: Start, protocol: EvalProtocol) -> dict[str, Array]:
-    """Columns of an evaluation's manifest, of starts in the default posture but for the legs."""
-    columns = {name: column.numpy() for name, column in start._asdict().items()}
-    qpos, legs = columns.pop("qpos"), load_robot(protocol.robot).default_q[:NUM_LEG_JOINTS]
-    return columns | {"base_height": qpos[:, 2], "leg_q": qpos[:, 7 : 7 + NUM_LEG_JOINTS] - legs}
 
 
 class Draws(NamedTuple):
@@ -69,32 +62,22 @@ def weakened(protocol: EvalProtocol, severity: float) -> EvalProtocol:
 
 
 def draw_starts(
-    protocol: EvalProtocol,
-    pool: TargetPool,
-    count: int,
-    rng: np.random.Generator,
-    curriculum: float = 1.0,
-    ahead: float = 0.0,
+    protocol: EvalProtocol, pool: TargetPool, count: int, rng: np.random.Generator, curriculum: float = 1.0
 ) -> Draws:
     """`count` episodes; the distributions are those of an evaluation's manifest (wbc_bench.randomization).
 
-    But for a share `ahead` of them, which begin in the stance that reaches the target, anywhere between the
-    default posture and the one that does. On the host.
+    On the host.
     """
     spread = protocol.randomization
     leg_q = rng.uniform(-spread.leg_q, spread.leg_q, (count, NUM_LEG_JOINTS))
     velocity = np.repeat([spread.base_lin_vel, spread.base_ang_vel], 3)
     push_step, push_vel = draw_pushes(protocol, count, rng)
-    default = load_robot(protocol.robot).default_q
-    qpos = np.zeros((count, 7 + NUM_JOINTS))
-    qpos[:, 2], qpos[:, 3] = [resting_height(protocol.robot, q) for q in leg_q], 1.0
-    qpos[:, 7:] = default
-    qpos[:, 7 : 7 + NUM_LEG_JOINTS] += leg_q
     columns = dict(
-        qpos=qpos,
+        base_height=np.array([resting_height(protocol.robot, q) for q in leg_q]),
         friction=rng.uniform(*spread.friction, count),
         base_mass=rng.uniform(*spread.base_mass, count),
         base_vel=rng.uniform(-velocity, velocity, (count, 6)),
+        leg_q=leg_q,
         leg_qd=rng.uniform(-spread.leg_qd, spread.leg_qd, (count, NUM_LEG_JOINTS)),
         kp_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
         kd_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
@@ -106,26 +89,9 @@ def draw_starts(
         members = np.flatnonzero(pool.stratum == k)
         mine = stratum == k
         target[mine] = members[(within[mine] * len(members)).astype(np.int64)]
-    decay = rng.uniform(*DECAY, count)
-    for row in np.flatnonzero(rng.random(count) < ahead):
-        qpos[row] = on_the_way(protocol, pool.witness_qpos[target[row]], rng.random())
     start = Start(**{name: torch.from_numpy(column) for name, column in columns.items()})
+    decay = rng.uniform(*DECAY, count)
     return Draws(start, target, *map(torch.from_numpy, (decay, push_step, push_vel)))
-
-
-def on_the_way(protocol: EvalProtocol, witness_qpos: NDArray, part: float) -> Array:
-    """A posture (21,), on the ground, `part` in [0, 1] of the way from the default one to a witness (21,).
-
-    In the stance of the witness. Every joint of a leg and the base's pitch go the same part of their way, so
-    that the soles stay level.
-    """
-    qpos = witness_qpos.astype(np.float64)
-    level = qpos[3:7] * [1, 0, 0, 1]  # yaw alone
-    qpos[3:7] = part * qpos[3:7] + (1 - part) * level / np.linalg.norm(level)
-    qpos[3:7] /= np.linalg.norm(qpos[3:7])
-    qpos[7:] = part * qpos[7:] + (1 - part) * load_robot(protocol.robot).default_q
-    qpos[2] -= lowest_sole(protocol.robot, qpos)
-    return qpos
 
 
 def draw_pushes(

@@ -72,7 +72,7 @@ def make_environment(settings: Settings, pool: TargetPool | None = None) -> Envi
     if pool is None:
         pool = read_pool(find_protocol(settings.protocol)[0])
     reward = METHODS[settings.method].reward
-    return Environment(protocol, backend, pool, reward, settings.seed, settings.severity(0), settings.ahead)
+    return Environment(protocol, backend, pool, reward, settings.seed, settings.severity(0))
 
 
 class Rollout:

@@ -12,12 +12,13 @@ MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10
 
 
 class Start(NamedTuple):
-    """How K episodes start, float64."""
+    """How K episodes start: columns as those of an evaluation's manifest, float64."""
 
-    qpos: Tensor  # (K, 21) position [m], wxyz, joints [rad]
+    base_height: Tensor  # (K,) [m]
     friction: Tensor  # (K,)
     base_mass: Tensor  # (K,) [kg] added
     base_vel: Tensor  # (K, 6) linear in the world [m/s], angular in the base [rad/s]
+    leg_q: Tensor  # (K, 8) [rad] added to the default posture
     leg_qd: Tensor  # (K, 8) [rad/s]
     kp_scale: Tensor  # (K, 14)
     kd_scale: Tensor  # (K, 14)

@@ -40,10 +40,13 @@ class CpuBackend:
         drawn = SimpleNamespace(**{name: column.numpy() for name, column in start._asdict().items()})
         self._randomise(rows, drawn)
         self._batch.reset(rows, stage=_STAGE_NONE)
-        qvel = np.zeros((len(rows), 20))
+        default = self._robot.default_q
+        qpos, qvel = np.zeros((len(rows), 21)), np.zeros((len(rows), 20))
+        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = drawn.base_height, 1.0, default
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += drawn.leg_q
         qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = drawn.base_vel, drawn.leg_qd
-        self._state["qpos"][rows], self._state["qvel"][rows] = drawn.qpos, qvel
-        self._state["ctrl"][rows] = self._robot.default_q
+        self._state["qpos"][rows], self._state["qvel"][rows] = qpos, qvel
+        self._state["ctrl"][rows] = default
         self._batch.forward(rows)
         return self._read(rows)
 

@@ -118,7 +118,9 @@ class WarpBackend:
         start = Start(*(column.float() for column in start))
         self._randomise(ids, start)
         default, count = self._default_q, len(ids)
-        qpos, qvel = start.qpos, torch.zeros(count, 20, device=self.device)
+        qpos, qvel = torch.zeros(count, 21, device=self.device), torch.zeros(count, 20, device=self.device)
+        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = start.base_height, 1.0, default
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += start.leg_q
         qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = start.base_vel, start.leg_qd
         self._state["qpos"][ids], self._state["qvel"][ids] = qpos, qvel
         self._state["ctrl"][ids] = default
