@@ -383,6 +383,20 @@ def test_claims(tmp_path):
     assert two.take()
 
 
+@pytest.mark.parametrize(
+    "change", [lambda rows: rows.pop("stratum"), lambda rows: rows.update(old=torch.zeros(1))]
+)
+def test_a_resume_file_of_another_version_is_one_line(tmp_path, change):
+    t, folder = trainer(), RunFolder(tmp_path / TINY.name)
+    folder.open(TINY)
+    runs.save_resume(t, folder, 0.0)
+    saved = torch.load(folder.resume)
+    change(saved["environment"]["episode"])
+    torch.save(saved, folder.resume)
+    with pytest.raises(TrainingError, match="is of another version of the code"):
+        runs.load_resume(t, folder)
+
+
 def test_a_damaged_resume_file_is_one_line(tmp_path):
     t, folder = trainer(), RunFolder(tmp_path / TINY.name)
     folder.open(TINY)

@@ -155,7 +155,7 @@ def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
     """Continue from the resume file, if there is one; seconds of training before.
 
     Raises:
-        TrainingError: the file cannot be read.
+        TrainingError: the file cannot be read, or another version of the code wrote it.
     """
     import pickle
     import zipfile
@@ -168,7 +168,13 @@ def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
         saved = torch.load(folder.resume, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
         raise TrainingError(f"resume file '{folder.resume}' cannot be read: {error}") from error
-    trainer.load(saved)
+    try:
+        trainer.load(saved)
+    except (KeyError, TypeError) as error:  # a field too few or too many
+        raise TrainingError(
+            f"resume file '{folder.resume}' is of another version of the code ({error}); valid: the version "
+            "that wrote it, or another --out with --start at the run's checkpoint"
+        ) from error
     return saved["seconds"]
 
 

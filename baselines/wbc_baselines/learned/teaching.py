@@ -2,9 +2,10 @@
 
 What is known need not be found out by reinforcement. A teacher answers in every state of a rollout and the
 policy is fitted to the answers: a checkpoint that knows more (alone at first, then beside PPO, less and
-less), or geometry for the joints of the arm alone, while PPO teaches the legs to carry it. Source: Ross,
-Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret online
-learning"; Schmitt et al. 2018, "Kickstarting deep reinforcement learning", for a teacher that fades.
+less), or geometry: for the arm, while PPO teaches the legs to carry it, and for legs that stand short of the
+target. Source: Ross, Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to
+no-regret online learning"; Schmitt et al. 2018, "Kickstarting deep reinforcement learning", for a teacher
+that fades.
 """
 
 import math
