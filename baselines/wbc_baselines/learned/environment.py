@@ -20,12 +20,9 @@ from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 
 STILL, STILL_TURNING = 0.15, 0.3  # [m/s], [rad/s] of the base; choice
-DUE = 0.5  # of the task-progress reference, below which the hand should have arrived; choice
+ARRIVES = 0.5  # of the task-progress reference, below which the hand should have arrived; choice
 CONTACT_FORCE = 1.0  # [N] vertical, from which a sole counts as loaded. Source: Isaac Lab's contact sensor
 OUTCOMES = ("success", "fell", "diverged", "length", "return", "pos_error", "rot_error", "timed_out")
-
-
-LEGS = slice(7, 7 + NUM_LEG_JOINTS)  # of a robot's qpos
 
 
 class View(NamedTuple):
@@ -74,7 +71,6 @@ class Seen(NamedTuple):
     term: Tensor  # (N, 57) noisy term of the estimators' window
     velocity: Tensor  # (N, 3) [m/s] true, base frame
     next_observation: Tensor  # (N, 49) without noise
-    lack: Tensor  # (N, 8) [rad] see `Environment._lack`
 
 
 class Step(NamedTuple):
@@ -177,7 +173,8 @@ class Environment:
         return Episode(
             target_pos_w=self._tensor(self._pool.pos_w[chosen]),
             target_rot_w=self._tensor(matrix_from_wxyz(self._pool.quat_w[chosen].astype(np.float64))),
-            posture=self._tensor(self._pool.witness_qpos[chosen, LEGS]) - self._default_q[:NUM_LEG_JOINTS],
+            posture=self._tensor(self._pool.witness_qpos[chosen, 7 : 7 + NUM_LEG_JOINTS])
+            - self._default_q[:NUM_LEG_JOINTS],
             stratum=torch.from_numpy(self._pool.stratum[chosen].astype(np.int64)).to(self.device),
             decay=draws.decay.float().to(self.device),
             push_step=draws.push_step.to(self.device),
@@ -363,10 +360,9 @@ class Environment:
             next_observation=inputs.next_observation(
                 ang_vel, view.gravity_b, view.joint_pos, joint_vel, view.ee, view.feet_b
             ),
-            lack=self._lack(),
         )
 
-    def _lack(self) -> Tensor:
+    def lack(self) -> Tensor:
         """What the legs lack [rad] (N, 8) of a posture that reaches the target, where robots should know it.
 
         That is where one stands still, need not step, and its hand is late; elsewhere 0.
@@ -376,7 +372,7 @@ class Environment:
         speed = torch.linalg.vector_norm(state.qvel[:, :3], dim=-1)
         turning = torch.linalg.vector_norm(state.qvel[:, 3:6], dim=-1)
         still = loaded & (speed < STILL) & (turning < STILL_TURNING)
-        late = (episode.d_ref < DUE) & (view.pos_error > self.protocol.success.position)
+        late = (episode.d_ref < ARRIVES) & (view.pos_error > self.protocol.success.position)
         in_place = episode.stratum != STRATA.index("step")
         lack = episode.posture - view.joint_pos[:, :NUM_LEG_JOINTS]
         return torch.where((still & late & in_place)[:, None], lack, 0.0)

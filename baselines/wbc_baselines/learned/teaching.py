@@ -18,7 +18,7 @@ from torch.nn.functional import huber_loss
 
 from wbc_baselines.learned.arm_ik import ArmKinematics
 from wbc_baselines.learned.checkpoint import Checkpoint
-from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS
+from wbc_baselines.learned.environment import ARRIVES, PRIVILEGED_COLUMNS
 from wbc_baselines.learned.imitation import DELTA
 from wbc_baselines.learned.inputs import COMMAND, OBSERVATION, OBSERVATION_LAYOUT, columns
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
@@ -31,7 +31,7 @@ BLEND = 0.3  # of the way from the policy's answer to the taught one, an iterati
 SHARE = 0.25  # of a rollout's states that are lessons beside PPO; choice: geometry costs as much as physics
 LEG_RATE, LEG_BLEND = 5e-5, 0.02  # the same of the legs, which PPO has to balance meanwhile; choice
 REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
-SETS_OUT, ARRIVES = 2.0, 0.5  # of the task-progress reference, while the arm leaves its default; choice
+SETS_OUT = 2.0  # of the task-progress reference, below which the arm leaves its default; choice
 LEGS, ARM = slice(NUM_LEG_JOINTS), slice(NUM_LEG_JOINTS, NUM_JOINTS)
 GRAVITY, JOINT_POS, REFERENCE = (
     columns(OBSERVATION_LAYOUT, term) for term in ("projected gravity", "joint positions", "task-progress")
@@ -45,6 +45,11 @@ class Fit:
         """action_scale (14,) [rad]."""
         self._actor, self._radians = actor, action_scale
         self.optimizer = torch.optim.Adam(actor.mlp.parameters(), RATE)
+
+    @torch.no_grad()
+    def means(self, observations: TensorDict) -> Tensor:
+        """What the policy (M, 14) itself would do, to be changed."""
+        return self._actor(observations).clone()
 
     def update(self, observations: TensorDict, action: Tensor, rate: float, epochs: int) -> float:
         """Fit the means to actions (M, 14) wanted in M states; the mean of `imitation.fit`'s loss [rad^2]."""
@@ -72,8 +77,7 @@ class Teaching:
 
     def __init__(self, teacher: Checkpoint, actor: MLPModel, action_scale: Tensor) -> None:
         """action_scale (14,) [rad]."""
-        self._actor, self.fit = actor, Fit(actor, action_scale)
-        self._teacher = teacher.actor.to(action_scale.device)
+        self._teacher, self.fit = teacher.actor.to(action_scale.device), Fit(actor, action_scale)
         self._privileged = teacher.estimator.context_dim > 0
 
     @torch.no_grad()
@@ -93,8 +97,7 @@ class Teaching:
     def advise(self, observations: TensorDict, weight: float) -> dict[str, float]:
         """Learn beside PPO from a share of the states of a rollout (T, N), with a weight in [0, 1]."""
         flat = _some(observations)
-        with torch.no_grad():
-            own = self._actor(flat).clone()
+        own = self.fit.means(flat)
         wanted = own + BLEND * weight * (self.answer(flat) - own)
         return {"advice": self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)}
 
@@ -107,7 +110,7 @@ class ArmTeaching:
 
     def __init__(self, robot: Robot, actor: MLPModel, action_scale: Tensor) -> None:
         """action_scale (14,) [rad]."""
-        self._actor, self.fit = actor, Fit(actor, action_scale)
+        self.fit = Fit(actor, action_scale)
         self._arm, self._scale = ArmKinematics(robot, action_scale.device), action_scale[ARM]
         self._default, self._kp = (
             torch.tensor(x[ARM], dtype=torch.float32, device=action_scale.device)
@@ -132,8 +135,7 @@ class ArmTeaching:
         if not reached.any():
             return {}
         flat, answer = flat[reached], answer[reached]
-        with torch.no_grad():
-            wanted = self._actor(flat).clone()
+        wanted = self.fit.means(flat)
         miss = self._scale * (answer - wanted[:, ARM])
         wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
         self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)
@@ -149,7 +151,7 @@ class PostureTeaching:
 
     def __init__(self, actor: MLPModel, action_scale: Tensor) -> None:
         """action_scale (14,) [rad]."""
-        self._actor, self.fit, self._scale = actor, Fit(actor, action_scale), action_scale[LEGS]
+        self.fit, self._scale = Fit(actor, action_scale), action_scale[LEGS]
 
     def update(self, observations: TensorDict) -> dict[str, float]:
         """Learn from the states of a rollout (T, N); the root mean square lack [rad]."""
@@ -158,8 +160,7 @@ class PostureTeaching:
         if len(flat) == 0:
             return {}
         lack = flat["lack"]
-        with torch.no_grad():
-            wanted = self._actor(flat).clone()
+        wanted = self.fit.means(flat)
         wanted[:, LEGS] += LEG_BLEND * lack / self._scale
         self.fit.update(flat, wanted, LEG_RATE, epochs=1)
         return {"posture_teaching": float(lack.square().mean().sqrt())}

@@ -368,7 +368,7 @@ class Trainer:
         elif self._context is not None:
             groups["context"] = self._context
         if self.settings.posture_teaching[1]:
-            groups["lack"] = seen.lack
+            groups["lack"] = self.environment.lack()
         return TensorDict(groups, batch_size=[self.environment.num_envs], device=self.device)
 
     def _update_estimator(self, rollout: Rollout) -> dict[str, float]:
