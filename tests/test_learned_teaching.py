@@ -39,8 +39,9 @@ def taught(**changes) -> tuple[Trainer, Teaching]:
 
 def arm_taught(**changes) -> tuple[Trainer, ArmTeaching]:
     t = trainer(**({"arm_teaching": (0.0, 3 * STEPS)} | changes))
-    assert t.arm_teaching
-    return t, t.arm_teaching
+    lessons = t.lessons["arm_teaching"]
+    assert isinstance(lessons, ArmTeaching)
+    return t, lessons
 
 
 @pytest.mark.parametrize("method", ["no_latent", "oracle"])
@@ -66,7 +67,7 @@ def test_the_teacher_drives_fewer_and_fewer_environments(tmp_path, monkeypatch):
         answers.clear()
         t.environment.begin_rollout(t.iteration, TINY.steps)
         t._roll_out()
-        t.iteration += 1
+        t.samples += STEPS
         t.ppo.storage.clear()
         same = [(a - w).abs().amax(-1) < 1e-4 for a, w in zip(done, answers, strict=False)]
         shares.append(float(torch.stack(same).float().mean()) if same else 0.0)
@@ -196,7 +197,7 @@ def test_a_lesson_moves_the_arm_a_part_of_the_way_where_it_reaches_and_leaves_th
 def test_legs_are_taught_a_part_of_what_they_lack(monkeypatch):
     """A fiftieth, in actions, where there is a lack; the arm stays."""
     t = trainer(posture_teaching=(0.0, 3 * STEPS))
-    legs = t.posture_teaching
+    legs = t.lessons["posture_teaching"]
     assert legs
     t.environment.begin_rollout(0, TINY.steps)
     t._roll_out()

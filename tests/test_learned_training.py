@@ -1,5 +1,6 @@
 """Training: gradients stay apart, sequences stay whole, a resumed run is bit-equal, files survive a kill."""
 
+import json
 import os
 import signal
 import subprocess
@@ -37,9 +38,10 @@ from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 from wbc_bench.rollout import evaluate  # noqa: E402
 
+STEPS = 8 * 6  # of an iteration
 TINY = Settings(
     "no_latent",
-    budget=4 * 8 * 6,
+    budget=4 * STEPS,
     envs=8,
     steps=6,
     minibatches=2,
@@ -391,10 +393,42 @@ def test_a_resume_file_of_another_version_is_one_line(tmp_path, change):
     folder.open(TINY)
     runs.save_resume(t, folder, 0.0)
     saved = torch.load(folder.resume)
-    change(saved["environment"]["episode"])
+    change(saved["episodes"]["environment"]["episode"])
     torch.save(saved, folder.resume)
     with pytest.raises(TrainingError, match="is of another version of the code"):
         runs.load_resume(t, folder)
+
+
+def test_a_changed_run_keeps_what_it_has_learned(tmp_path):
+    """Other environments, rates and lessons: networks and counters stay, episodes are new ones."""
+    folder = RunFolder(tmp_path / TINY.name)
+    run(replace(TINY, budget=2 * STEPS), folder, tensorboard=False)
+    before = torch.load(folder.resume)
+    other = replace(TINY, budget=2 * STEPS + 24, envs=4, learning_rate=1e-4, arm_teaching=(0.0, 1e6))
+    with pytest.raises(TrainingError, match=r"envs 8 -> 4, learning_rate 0.0003 -> 0.0001, .*or --change"):
+        folder.open(other)
+    folder.open(other, change=True)
+    (row,) = map(json.loads, folder.changes.read_text().splitlines())
+    assert row["samples"] == 2 * STEPS and row["changed"]["envs"] == [8, 4]
+    folder.open(other, change=True)  # nothing is new any more
+    assert len(folder.changes.read_text().splitlines()) == 1
+    t = Trainer(other, make_environment(other))
+    runs.load_resume(t, folder)
+    assert (t.iteration, t.samples, t.done) == (2, 2 * STEPS, False)
+    assert_equal(t.ppo.save()["actor_state_dict"], before["ppo"]["actor_state_dict"])
+    assert_equal(t.ppo.save()["critic_state_dict"], before["ppo"]["critic_state_dict"])
+    # a kill before the first save leaves the same to go on with: the same draws, not those of the beginning
+    again = Trainer(other, make_environment(other))
+    fresh = again.environment.save()
+    runs.load_resume(again, folder)
+    assert_equal(t.save(), again.save())
+    assert not torch.equal(
+        fresh["episode"]["target_pos_w"], t.save()["episodes"]["environment"]["episode"]["target_pos_w"]
+    )
+    run(other, folder, tensorboard=False)
+    assert [r["samples"] for r in folder.read_metrics()] == [STEPS, 2 * STEPS, 2 * STEPS + 24]
+    with pytest.raises(TrainingError, match=r"seed 0 -> 1; .*but for method, seed, protocol"):
+        folder.open(replace(other, seed=1), change=True)
 
 
 def test_a_damaged_resume_file_is_one_line(tmp_path):

@@ -22,6 +22,9 @@ class Run:
     settings: OmitArgPrefixes[Settings]
     out: Path = RUNS
     """Folder of runs; this one goes into OUT/METHOD@SEED."""
+    change: bool = False
+    """Go on with these settings where the run was started with others (another --envs, --backend, schedule),
+    in new episodes; what changes is noted in the run's changes.jsonl."""
 
     def run(self) -> None:
         from wbc_baselines.learned.runs import RunFolder, run
@@ -29,7 +32,7 @@ class Run:
 
         folder = RunFolder(self.out / self.settings.name)
         with Progress("steps") as progress:
-            run(self.settings, folder, progress.update)
+            run(self.settings, folder, progress.update, change=self.change)
         print(folder.path)
 
 

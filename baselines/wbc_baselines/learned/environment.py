@@ -119,20 +119,19 @@ class Environment:
         self._scale = self._tensor(self._robot.action_scale)
         self._noise = torch.zeros(1, self.num_envs, inputs.HISTORY_TERM, device=self.device)
         self._at = 0  # row of the noise
-        self._bank = _Bank(0, self.severity, self.curriculum)
         self.clear_log()
-        self._start()
+        self.begin()
 
     # ---- episodes ------------------------------------------------------------------------------------------
 
-    def _start(self) -> None:
-        """Episodes of all ages, so that they do not end together."""
+    def begin(self, number: int = 0) -> None:
+        """Episodes of all ages, so that they do not end together, from the draws of this number on."""
         count = self.num_envs
-        self._draw(self._bank)
+        self._draw(_Bank(number, self.severity, self.curriculum))
         start, self._episode = self._take(count)
         self._state = self._backend.reset(torch.arange(count, device=self.device), start)
         self._view = self._derive(self._state, self._state, self._episode)
-        rng = stream(self._seed, "training age")
+        rng = stream(self._seed, "training age", number)
         age = torch.from_numpy(rng.integers(0, self.protocol.num_steps, count)).to(self.device)
         self._begin(self._episode, self._view)
         self._episode.step[:] = age

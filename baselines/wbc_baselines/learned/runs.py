@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 CHECKPOINT_PERIOD = 90.0  # [s] between resume files: what a kill can cost
 STALE = 900.0  # [s] without a sign of life after which a claim may be taken over
-FREE = frozenset({"budget", "threads"})  # settings that may differ when a run goes on
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,11 @@ class RunFolder:
     def metrics(self) -> Path:
         """One JSON object an iteration; after a resume, the later line of an iteration counts."""
         return self.path / "metrics.jsonl"
+
+    @property
+    def changes(self) -> Path:
+        """One JSON object a change: control steps so far, and each changed setting before and after."""
+        return self.path / "changes.jsonl"
 
     @property
     def resume(self) -> Path:
@@ -55,31 +59,29 @@ class RunFolder:
         """Written last, when budget and final checkpoint are there."""
         return self.path / "finished.json"
 
-    def open(self, settings: Settings) -> None:
-        """Make the folder, or check that it belongs to these settings.
+    def open(self, settings: Settings, change: bool = False) -> None:
+        """Make the folder, or check that it belongs to these settings; with `change`, note what is new.
 
         Raises:
             TrainingError: it holds a run with other settings; they are listed.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        mine = asdict(settings)
-        if not self.settings.exists():
-            write_atomic(self.settings, json.dumps(mine, indent=2).encode())
-            return
-        # a setting that is newer than the run had its default
-        theirs = asdict(Settings(settings.method)) | json.loads(self.settings.read_text())
-        mine, theirs = (json.loads(json.dumps(s)) for s in (mine, theirs))  # tuples become lists
-        wrong = [
-            f"{name} {theirs[name]} -> {value}"
-            for name, value in mine.items()
-            if name not in FREE and theirs[name] != value
-        ]
-        if wrong:
-            raise TrainingError(
-                f"run '{self.path}' was started with other settings: {', '.join(wrong)}; "
-                "valid: the same, or another --out"
-            )
-        write_atomic(self.settings, json.dumps(mine, indent=2).encode())
+        if self.settings.exists():
+            changed = settings.changes(json.loads(self.settings.read_text()))
+            fixed = ("method", "seed", "protocol")  # what the run is called and judged by
+            wrong = {n: c for n, c in changed.items() if not change or n in fixed}
+            if wrong:
+                told = ", ".join(f"{name} {old} -> {new}" for name, (old, new) in wrong.items())
+                raise TrainingError(
+                    f"run '{self.path}' was started with other settings: {told}; "
+                    "valid: the same, another --out, or --change"
+                    + (f", but for {', '.join(fixed)}" if change else "")
+                )
+            if changed:
+                rows = self.read_metrics()
+                row = {"samples": rows[-1]["samples"] if rows else 0, "changed": changed}
+                _append(self.changes, row)
+        write_atomic(self.settings, json.dumps(asdict(settings), indent=2).encode())
 
     def read_metrics(self) -> list[dict]:
         """Metrics by iteration; a line that a kill has cut short is left out."""
@@ -96,10 +98,7 @@ class RunFolder:
 
     def append(self, row: dict) -> None:
         """Add one iteration's metrics."""
-        with self.metrics.open("a+b") as file:
-            if file.tell() and not _ends_with_newline(file):
-                file.write(b"\n")  # the line before was cut short
-            file.write(json.dumps(row).encode() + b"\n")
+        _append(self.metrics, row)
 
     def take(self) -> bool:
         """Claim the run for this process; False if another, living one has it."""
@@ -183,8 +182,11 @@ def run(
     folder: RunFolder,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     tensorboard: bool = True,
+    change: bool = False,
 ) -> None:
     """Train from wherever the folder stands to the budget, and write the final checkpoint.
+
+    With `change`, a run that was started with other settings goes on with these, in new episodes.
 
     Raises:
         TrainingError: see `RunFolder.open`, `load_resume`, `Trainer.iterate`; or another process has the run.
@@ -192,7 +194,7 @@ def run(
     from wbc_baselines.learned.training import Trainer, make_environment
 
     settings.check()
-    folder.open(settings)
+    folder.open(settings, change)
     if not folder.take():
         raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
     try:
@@ -258,6 +260,13 @@ def _writer(folder: RunFolder, iteration: int):
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration or None)
+
+
+def _append(path: Path, row: dict) -> None:
+    with path.open("a+b") as file:
+        if file.tell() and not _ends_with_newline(file):
+            file.write(b"\n")  # the line before was cut short
+        file.write(json.dumps(row).encode() + b"\n")
 
 
 def _ends_with_newline(file) -> bool:

@@ -1,11 +1,13 @@
 """The settings of a training run."""
 
-import math
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 from wbc_baselines.learned.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
+
+FREE = frozenset({"budget", "threads"})  # settings that what a run learns does not depend on
 
 
 class TrainingError(BenchError):
@@ -109,10 +111,15 @@ class Settings:
         """METHOD@SEED."""
         return f"{self.method}@{self.seed}"
 
-    @property
-    def iterations(self) -> int:
-        """Whole rollouts that reach the budget."""
-        return math.ceil(self.budget / (self.envs * self.steps))
+    def changes(self, before: dict) -> dict[str, tuple[object, object]]:
+        """Before and now, of what differs from a run's earlier settings and what it learns depends on."""
+        before = asdict(Settings(self.method)) | before  # a setting newer than the run had its default
+        old, new = (
+            json.loads(json.dumps(settings)) for settings in (before, asdict(self))
+        )  # lists of tuples
+        return {
+            name: (old[name], value) for name, value in new.items() if name not in FREE and old[name] != value
+        }
 
     # Schedules count control steps, not parts of the budget: a run is the beginning of every longer one.
 

@@ -10,6 +10,7 @@ import math
 import time
 import zlib
 from collections.abc import Iterator
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -117,7 +118,8 @@ class Trainer:
         settings.check()
         self.settings, self.environment = settings, environment
         self.method = METHODS[settings.method]
-        self.iteration, self.device = 0, environment.device
+        self.iteration, self.samples = 0, 0  # control steps so far
+        self.device = environment.device
         self._origins = tuple(checkpoint.identity(name) for name in (settings.start, settings.teacher))
         if settings.backend == "cpu":
             torch.set_num_threads(settings.threads)
@@ -135,25 +137,30 @@ class Trainer:
                         count.fill_(settings.start_samples)
         self._privileged = self.method.estimator == "oracle"
         self._estimates = self.method.estimates
-        seen = environment.seen
-        self._history = History(seen.term)
-        self._state = torch.zeros(environment.num_envs, self.estimator.state_dim, device=self.device)
-        self._start = torch.ones(environment.num_envs, dtype=torch.bool, device=self.device)
-        self._context = self._estimate() if self._estimates else None
+        self._begin()
         self.ppo = self._make_ppo(start)
         robot = load_robot(environment.protocol.robot)
         scale = torch.tensor(robot.action_scale, dtype=torch.float32, device=self.device)
-        self.teaching = self.arm_teaching = self.posture_teaching = None
+        self.teaching = None
         if settings.teacher:
             self.teaching = Teaching(checkpoint.load_teacher(settings.teacher), self.ppo.actor, scale)
+        self.lessons: dict[str, ArmTeaching | PostureTeaching] = {}  # of geometry, by their setting
         if settings.arm_teaching[1]:
-            self.arm_teaching = ArmTeaching(robot, self.ppo.actor, scale)
+            self.lessons["arm_teaching"] = ArmTeaching(robot, self.ppo.actor, scale)
         if settings.posture_teaching[1]:
-            self.posture_teaching = PostureTeaching(self.ppo.actor, scale)
+            self.lessons["posture_teaching"] = PostureTeaching(self.ppo.actor, scale)
         parameters = list(self.estimator.parameters())
         self.optimizer = (
             torch.optim.Adam(parameters, settings.estimator_learning_rate) if parameters else None
         )
+
+    def _begin(self) -> None:
+        """An empty history and an estimator at rest, for episodes that begin now."""
+        count = self.environment.num_envs
+        self._history = History(self.environment.seen.term)
+        self._state = torch.zeros(count, self.estimator.state_dim, device=self.device)
+        self._start = torch.ones(count, dtype=torch.bool, device=self.device)
+        self._context = self._estimate() if self._estimates else None
 
     def _make_ppo(self, start: checkpoint.Checkpoint | None) -> PPO:
         settings, seen = self.settings, self._observations()
@@ -238,18 +245,13 @@ class Trainer:
     # ---- one iteration -------------------------------------------------------------------------------------
 
     @property
-    def samples(self) -> int:
-        """Control steps so far."""
-        return self.iteration * self.settings.envs * self.settings.steps
-
-    @property
     def _taught(self) -> float:
         return self.settings.taught(self.samples)
 
     @property
     def done(self) -> bool:
         """Whether the budget is used up."""
-        return self.iteration >= self.settings.iterations
+        return self.samples >= self.settings.budget
 
     def iterate(self) -> dict[str, float]:
         """Roll out, update policy and estimator; what is worth logging, by name."""
@@ -271,16 +273,15 @@ class Trainer:
             losses |= self.teaching.update(ppo.storage.observations, self._taught)
         elif self.teaching and (weight := settings.advice(self.samples)):
             losses |= self.teaching.advise(ppo.storage.observations, weight)
-        for lessons, (begin, end) in (
-            (self.arm_teaching, settings.arm_teaching),
-            (self.posture_teaching, settings.posture_teaching),
-        ):
-            if lessons and begin <= self.samples < end:
+        for name, lessons in self.lessons.items():
+            begin, end = getattr(settings, name)
+            if begin <= self.samples < end:
                 losses |= lessons.update(ppo.storage.observations)
         clock.append(time.perf_counter())
         losses |= self._update_estimator(rollout) if rollout else {}
         clock.append(time.perf_counter())
         self.iteration += 1
+        self.samples += settings.envs * settings.steps
         found = {f"loss/{name}": float(value) for name, value in losses.items()}
         wrong = [name for name, value in found.items() if value != value or abs(value) == float("inf")]
         if wrong:
@@ -386,9 +387,9 @@ class Trainer:
         self.estimator.observe(rollout.history)
         return {name: float(value) / settings.estimator_minibatches for name, value in sums.items()}
 
-    def _fits(self) -> list[Fit]:
-        all_of_them = (self.teaching, self.arm_teaching, self.posture_teaching)
-        return [teaching.fit for teaching in all_of_them if teaching]
+    def _fits(self) -> dict[str, Fit]:
+        taught = {"teaching": self.teaching.fit} if self.teaching else {}
+        return taught | {name: lessons.fit for name, lessons in self.lessons.items()}
 
     # ---- networks for an evaluation, and everything for a resume -------------------------------------------
 
@@ -416,23 +417,27 @@ class Trainer:
             name: value for name, value in self.estimator.named_buffers() if name.endswith("normalizer.count")
         }
         return {
+            "settings": asdict(self.settings),
             "iteration": self.iteration,
+            "samples": self.samples,
             "ppo": self.ppo.save(),
             "learning_rate": self.ppo.learning_rate,
             "estimator": self.estimator.state_dict() | counts,
             "optimizer": self.optimizer.state_dict() if self.optimizer else {},
-            "teaching": [fit.optimizer.state_dict() for fit in self._fits()],
-            "environment": self.environment.save(),
-            "history": self._history.window,
-            "state": self._state,
-            "state_before": self._state_before if self._estimates else self._state,
-            "start": self._start,
-            "context": self._context if self._context is not None else torch.zeros(0),
+            "teaching": {name: fit.optimizer.state_dict() for name, fit in self._fits().items()},
+            "episodes": {
+                "environment": self.environment.save(),
+                "history": self._history.window,
+                "state": self._state,
+                "state_before": self._state_before if self._estimates else self._state,
+                "start": self._start,
+                "context": self._context if self._context is not None else torch.zeros(0),
+            },
         }
 
     def load(self, saved: dict) -> None:
-        """Go on from what `save` returned, bit by bit."""
-        self.iteration = saved["iteration"]
+        """Go on from what `save` returned: bit by bit, or with new episodes where settings have changed."""
+        self.iteration, self.samples = saved["iteration"], saved["samples"]
         self.ppo.load(saved["ppo"], None, strict=True)
         self.ppo.learning_rate = saved["learning_rate"]
         buffers = dict(self.estimator.named_buffers())
@@ -444,14 +449,21 @@ class Trainer:
         )
         if self.optimizer:
             self.optimizer.load_state_dict(saved["optimizer"])
-        for fit, state in zip(self._fits(), saved["teaching"], strict=True):
-            fit.optimizer.load_state_dict(state)
-        self.environment.load(saved["environment"])
-        self._history.window = saved["history"].to(self.device)
-        self._state, self._start = saved["state"].to(self.device), saved["start"].to(self.device)
-        self._state_before = saved["state_before"].to(self.device)
+        for name, fit in self._fits().items():
+            if name in saved["teaching"]:  # or these lessons are new
+                fit.optimizer.load_state_dict(saved["teaching"][name])
+        if self.settings.changes(saved["settings"]):
+            torch.manual_seed(_key(self.settings.seed, "episodes", self.iteration))
+            self.environment.begin(self.iteration)  # draws that no iteration before has come to
+            self._begin()
+            return
+        episodes = saved["episodes"]
+        self.environment.load(episodes["environment"])
+        self._history.window = episodes["history"].to(self.device)
+        self._state, self._start = episodes["state"].to(self.device), episodes["start"].to(self.device)
+        self._state_before = episodes["state_before"].to(self.device)
         if self._estimates:
-            self._context = saved["context"].to(self.device)
+            self._context = episodes["context"].to(self.device)
 
 
 def advantages(
