@@ -15,10 +15,12 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
+from mujoco.batch import Batch  # noqa: E402
 from tensordict import TensorDict  # noqa: E402
 from test_learned_environment import POOL, manifest_of  # noqa: E402
 
 from wbc_baselines.learned import checkpoint, runs  # noqa: E402
+from wbc_baselines.learned.backends import cpu  # noqa: E402
 from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.campaign import campaign, is_done, runs_of, standing  # noqa: E402
 from wbc_baselines.learned.cli import main  # noqa: E402
@@ -29,8 +31,10 @@ from wbc_baselines.learned.inputs import History  # noqa: E402
 from wbc_baselines.learned.methods import METHODS  # noqa: E402
 from wbc_baselines.learned.runs import RunFolder, run  # noqa: E402
 from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
+from wbc_baselines.learned.speed import measure  # noqa: E402
 from wbc_baselines.learned.starts import draw_starts  # noqa: E402
 from wbc_baselines.learned.training import Trainer, advantages, make_environment  # noqa: E402
+from wbc_bench import simulation  # noqa: E402
 from wbc_bench.controller import load_controller  # noqa: E402
 from wbc_bench.errors import UnknownNameError  # noqa: E402
 from wbc_bench.protocol import Noise, Push, find_protocol  # noqa: E402
@@ -496,13 +500,16 @@ def test_mistakes_name_the_valid_values():
 
 
 def test_the_command_line(tmp_path, capsys):
-    """`wbc-train run` with a budget like 6e7, then `status`; a mistake is one line and code 2."""
+    """`wbc-train run` with a budget like 6e7, changed, a campaign, `status`; a mistake is one line and code 2."""
     options = ["--budget", "4.8e1", "--envs", "8", "--steps", "6", "--minibatches", "2", "--threads", "1"]
     options += ["--estimator-share", "0.5", "--out", str(tmp_path)]
     main(["run", "--method", "no_latent", *options])
+    main(["run", "--method", "no_latent", *options, "--budget", "9.6e1", "--epochs", "1", "--change"])
+    main(["campaign", "--methods", "oracle", "--seeds", "1", *options])
     main(["status", "--out", str(tmp_path)])
     told = capsys.readouterr().out
-    assert "no_latent@0" in told and "done" in told
+    assert all(name in told for name in ("no_latent@0", "oracle@0", "done"))
+    assert RunFolder(tmp_path / "no_latent@0").read_metrics()[-1]["samples"] == 96
     with pytest.raises(SystemExit) as stopped:
         main(["run", "--method", "oracel", *options])
     error = capsys.readouterr().err
@@ -538,3 +545,14 @@ def test_advantages_without_pushes_are_rsl_rls():
     torch.testing.assert_close(storage.advantages, (expected - expected.mean()) / (expected.std() + 1e-8))
     torch.testing.assert_close(ends.ppo.storage.returns, storage.returns)
     assert (ends.ppo.storage.advantages - storage.advantages).abs().max() > 1e-2
+
+
+def test_the_bench_times_the_engine_and_leaves_it_as_it_was():
+    settings = replace(TINY, start="oracle@0")
+    fast, slow = measure(settings, ("no_latent", "cenet"), rounds=2, episodes=2)
+    for found in (fast, slow):
+        assert 0.0 < found.training < 1.0
+        assert found.training == pytest.approx(found.steps / found.physics)  # of a single round
+    assert fast.evaluation is not None and 0.0 < fast.evaluation < 1.0
+    assert slow.evaluation is None  # no such policy ships
+    assert cpu.Batch is simulation.Batch is Batch

@@ -40,7 +40,7 @@ class Run:
 class Campaign:
     """Train all methods x seeds at an equal budget; run it on several machines that share OUT, or again."""
 
-    settings: OmitArgPrefixes[Settings]
+    settings: OmitArgPrefixes[Settings] = Settings("transformer_gru")
     methods: tuple[str, ...] = ()
     """Methods instead of --method; all when not given."""
     seeds: int = 3
@@ -130,6 +130,39 @@ class Gates:
             if rows := RunFolder(path.parent).read_metrics():
                 phase, score_m, score_l = measured_scores(rows)
                 print(f"{path.parent.name}: PHASE {phase:.4f}, SCORE_M {score_m:.3f}, SCORE_L {score_l:.3f}")
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure how fast methods train and run, over the physics alone; on an idle machine, please."""
+
+    settings: OmitArgPrefixes[Settings] = Settings("transformer_gru")
+    methods: tuple[str, ...] = ("no_latent", "transformer_gru")
+    """Methods instead of --method."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.campaign import runs_of
+        from wbc_baselines.learned.speed import measure
+        from wbc_bench.markup import Table
+
+        if self.settings.backend != "cpu":
+            raise TrainingError(f"--backend {self.settings.backend}: valid: cpu, whose engine is timed")
+        runs_of(self.settings, self.methods, 1)  # refuses what cannot be run
+        found = measure(self.settings, self.methods)
+        cells = [
+            (
+                s.method,
+                f"{s.steps:.0f}",
+                f"{s.physics:.0f}",
+                f"{s.training:.2f}",
+                f"{s.steps / found[0].steps:.2f}",
+                "–" if s.evaluation is None else f"{s.evaluation:.2f}",
+            )
+            for s in found
+        ]
+        columns = ("Method", "Training (control steps/s)", "Physics alone (control steps/s)")
+        columns += ("Training / physics", f"Training / {found[0].method}'s", "Physics in an evaluation")
+        print(Table("speed", "Speed beside physics alone", columns, tuple(cells)).markdown())
 
 
 @dataclass(frozen=True)
@@ -226,6 +259,7 @@ Command = (
     | Annotated[Status, subcommand("status")]
     | Annotated[Curves, subcommand("curves")]
     | Annotated[Gates, subcommand("gates")]
+    | Annotated[Bench, subcommand("bench")]
     | Annotated[Imitate, subcommand("imitate")]
     | Annotated[Targets, subcommand("targets")]
 )

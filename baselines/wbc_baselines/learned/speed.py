@@ -1,0 +1,111 @@
+"""What training and evaluation take beside the physics that they need, measured side by side in one run."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from statistics import median
+from typing import NamedTuple
+
+import mujoco.batch
+
+import wbc_bench.simulation
+from wbc_baselines.learned import checkpoint
+from wbc_baselines.learned.settings import Settings
+
+ROUNDS = 5  # the first is warm-up; methods take turns, so that all meet the same machine
+EPISODES = 50  # of an evaluation, as many as in a shard
+
+
+class Speed(NamedTuple):
+    """One method on this machine: medians over the rounds."""
+
+    method: str
+    steps: float  # control steps/s of training
+    physics: float  # control steps/s of the engine alone, in the same states
+    training: float  # the engine's share of training's time: the first over the second
+    evaluation: float | None  # the engine's share of an evaluation's time, one thread; None without a policy
+
+
+class EngineClock(mujoco.batch.Batch):
+    """MuJoCo's batch of simulations, which counts the time that its steps take."""
+
+    seconds = 0.0
+
+    def step(self, *arguments, **options):
+        begun = time.perf_counter()
+        super().step(*arguments, **options)
+        EngineClock.seconds += time.perf_counter() - begun
+
+
+def measure(
+    settings: Settings, methods: Sequence[str], rounds: int = ROUNDS, episodes: int = EPISODES
+) -> list[Speed]:
+    """Train and evaluate the methods in turns, each from its policy that ships, or else from the oracle's.
+
+    Training is PPO without a teacher; lessons of geometry are in if they begin at 0 control steps.
+    """
+    from wbc_baselines.learned.training import Trainer, make_environment
+
+    ours = {method: f"{method}@{settings.seed}" for method in methods}
+    ours = {method: name for method, name in ours.items() if name in checkpoint.available()}
+    control_steps = settings.envs * settings.steps
+    training: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
+    evaluation: dict[str, list[float]] = {method: [] for method in methods}
+    with _engine_clocks():
+        trainers = []
+        for method in methods:
+            chosen = replace(settings, method=method, start=ours.get(method, "oracle@0"), teacher="")
+            trainers.append(Trainer(chosen, make_environment(chosen)))
+        for _ in range(rounds):
+            for trainer in trainers:
+                before = EngineClock.seconds
+                found = trainer.iterate()
+                whole = sum(found[f"time/{part}"] for part in ("rollout", "policy", "estimator"))
+                training[trainer.settings.method].append((whole, EngineClock.seconds - before))
+            for method, name in ours.items():
+                evaluation[method].append(_evaluation(f"learned:{name}", settings, episodes))
+    return [
+        Speed(
+            method,
+            control_steps / median(whole for whole, _ in rows[1:]),
+            control_steps / median(engine for _, engine in rows[1:]),
+            median(engine / whole for whole, engine in rows[1:]),
+            median(evaluation[method][1:]) if method in ours else None,
+        )
+        for method, rows in training.items()
+    ]
+
+
+def _evaluation(spec: str, settings: Settings, episodes: int) -> float:
+    """The engine's share of the time that the protocol's first episodes take, as one shard."""
+    import torch
+
+    from wbc_bench.execution import evaluate_shard
+    from wbc_bench.manifest import manifest_path, read_manifest
+    from wbc_bench.protocol import find_protocol
+
+    protocol, path = find_protocol(settings.protocol)
+    manifest, _ = read_manifest(protocol, manifest_path(path))
+    rows = manifest.of_replicate(0, episodes)
+    torch.set_num_threads(1)
+    begun, before = time.perf_counter(), EngineClock.seconds
+    evaluate_shard(spec, protocol, rows)
+    share = (EngineClock.seconds - before) / (time.perf_counter() - begun)
+    torch.set_num_threads(settings.threads)
+    return share
+
+
+@contextmanager
+def _engine_clocks() -> Iterator[None]:
+    """Have simulations of training and evaluation made from here on count their engine's time."""
+    from wbc_baselines.learned.backends import cpu
+
+    places = (cpu, wbc_bench.simulation)
+    for place in places:
+        place.Batch = EngineClock
+    try:
+        yield
+    finally:
+        for place in places:
+            place.Batch = mujoco.batch.Batch
