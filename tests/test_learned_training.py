@@ -58,6 +58,7 @@ TINY = Settings(
     teacher="",
     critic_iterations=0,
     calm=(0.0, 0.0),
+    posture_teaching=(0.0, 0.0),
 )
 
 
@@ -500,7 +501,7 @@ def test_mistakes_name_the_valid_values():
 
 
 def test_the_command_line(tmp_path, capsys):
-    """`wbc-train run` with a budget like 6e7, changed, a campaign, `status`; a mistake is one line and code 2."""
+    """`wbc-train run`, changed, a campaign, `status`; a mistake is one line and code 2."""
     options = ["--budget", "4.8e1", "--envs", "8", "--steps", "6", "--minibatches", "2", "--threads", "1"]
     options += ["--estimator-share", "0.5", "--out", str(tmp_path)]
     main(["run", "--method", "no_latent", *options])

@@ -13,6 +13,7 @@ from wbc_baselines.learned.settings import Settings, TrainingError
 from wbc_bench.cli import run_command
 
 RUNS = Path("runs")
+DEFAULTS = Settings("transformer_gru")  # of what trains methods given otherwise
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Run:
 class Campaign:
     """Train all methods x seeds at an equal budget; run it on several machines that share OUT, or again."""
 
-    settings: OmitArgPrefixes[Settings] = Settings("transformer_gru")
+    settings: OmitArgPrefixes[Settings] = DEFAULTS
     methods: tuple[str, ...] = ()
     """Methods instead of --method; all when not given."""
     seeds: int = 3
@@ -136,7 +137,7 @@ class Gates:
 class Bench:
     """Measure how fast methods train and run, over the physics alone; on an idle machine, please."""
 
-    settings: OmitArgPrefixes[Settings] = Settings("transformer_gru")
+    settings: OmitArgPrefixes[Settings] = DEFAULTS
     methods: tuple[str, ...] = ("no_latent", "transformer_gru")
     """Methods instead of --method."""
 

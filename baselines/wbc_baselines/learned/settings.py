@@ -61,28 +61,29 @@ class Settings:
     before any update of the policy."""
     teacher: str = "oracle@0"
     """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 4e6
+    teacher_steps: float = 8e6
     """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
     the first half the teacher drives in a part of the environments, at first in all."""
-    advice_steps: float = 12e6
+    advice_steps: float = 30e6
     """Control steps until which it then advises beside PPO, less and less; 0 for never."""
-    arm_teaching: tuple[float, float] = (4e6, 100e6)
+    arm_teaching: tuple[float, float] = (8e6, 57e6)
     """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
-    posture_teaching: tuple[float, float] = (0.0, 0.0)
+    posture_teaching: tuple[float, float] = (8e6, 57e6)
     """Control steps from which on and until when robots that stand still, short of a target in reach, are
-    taught a posture of the legs that reaches it, beside PPO."""
+    taught a posture of the legs that reaches it, beside PPO; 0 0 for never, as above."""
     mirror: bool = False
     """Whether PPO also learns from the mirror image of every sample; for methods without an estimator, whose
     inputs have one."""
     critic_iterations: int = 15
     """First iterations in which only the critic learns: it knows nothing of a start's returns."""
-    std_legs: tuple[float, float] = (0.27, 0.1)
+    std_legs: tuple[float, float] = (0.27, 0.05)
     """Standard deviation of the leg actions at the start and in the end. Who learns at 0.14 stands still and
     falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
-    std_arm: tuple[float, float] = (0.4, 0.1)
+    std_arm: tuple[float, float] = (0.4, 0.05)
     """Standard deviation of the arm actions at the start and in the end."""
-    std_steps: tuple[float, float] = (50e6, 60e6)
-    """Control steps from which on and until when they fall, exponentially: the last part of the budget."""
+    std_steps: tuple[float, float] = (36e6, 58e6)
+    """Control steps from which on and until when they fall, exponentially: the last two fifths of the
+    budget. What succeeds at all, succeeds while they fall."""
     timestep: float = 0.01
     """[s] of the physics; an evaluation always takes the protocol's."""
     decimation: int = 2
