@@ -500,12 +500,23 @@ def test_mistakes_name_the_valid_values():
         make_environment(replace(TINY, timestep=0.01, decimation=3))
 
 
-def test_the_command_line(tmp_path, capsys):
+def test_the_command_line(tmp_path, capsys, monkeypatch):
     """`wbc-train run`, changed, a campaign, `status`; a mistake is one line and code 2."""
     options = ["--budget", "4.8e1", "--envs", "8", "--steps", "6", "--minibatches", "2", "--threads", "1"]
     options += ["--estimator-share", "0.5", "--out", str(tmp_path)]
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
     main(["run", "--method", "no_latent", *options])
-    main(["run", "--method", "no_latent", *options, "--budget", "9.6e1", "--epochs", "1", "--change"])
+    more = ["run", "--method", "no_latent", *options, "--budget", "9.6e1", "--epochs", "1", "--change"]
+    with monkeypatch.context() as patched:
+        patched.setattr(Trainer, "iterate", interrupted)
+        with pytest.raises(SystemExit):
+            main(more)
+    main(["status", "--out", str(tmp_path)])
+    assert "interrupted" in capsys.readouterr().out  # not done, at the larger budget
+    main(more)
     main(["campaign", "--methods", "oracle", "--seeds", "1", *options])
     main(["status", "--out", str(tmp_path)])
     told = capsys.readouterr().out

@@ -200,6 +200,8 @@ def run(
     try:
         trainer = Trainer(settings, make_environment(settings))
         before = load_resume(trainer, folder)
+        if not trainer.done:
+            folder.finished.unlink(missing_ok=True)  # at a smaller budget
         started, first = time.monotonic() - before, trainer.samples
         saved = time.monotonic()
         writer = _writer(folder, trainer.iteration) if tensorboard else None
