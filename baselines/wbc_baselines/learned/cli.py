@@ -1,6 +1,5 @@
 """The command line of training: `wbc-train COMMAND --help`."""
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -268,8 +267,6 @@ Command = (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point; ends as `run_command` says."""
-    # a worker of torch that spins while it waits would take a core from the physics threads
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     command = tyro.cli(
         Command, prog="wbc-train", description="Train the learned controllers.", args=arguments
     )

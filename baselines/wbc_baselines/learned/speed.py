@@ -45,6 +45,8 @@ def measure(
 
     Training is PPO without a teacher; lessons of geometry are in if they begin at 0 control steps.
     """
+    import torch
+
     from wbc_baselines.learned.training import Trainer, make_environment
 
     ours = {method: f"{method}@{settings.seed}" for method in methods}
@@ -63,6 +65,8 @@ def measure(
                 found = trainer.iterate()
                 whole = sum(found[f"time/{part}"] for part in ("rollout", "policy", "estimator"))
                 training[trainer.settings.method].append((whole, EngineClock.seconds - before))
+        torch.set_num_threads(1)
+        for _ in range(rounds):
             for method, name in ours.items():
                 evaluation[method].append(_evaluation(f"learned:{name}", settings, episodes))
     return [
@@ -79,8 +83,6 @@ def measure(
 
 def _evaluation(spec: str, settings: Settings, episodes: int) -> float:
     """The engine's share of the time that the protocol's first episodes take, as one shard."""
-    import torch
-
     from wbc_bench.execution import evaluate_shard
     from wbc_bench.manifest import manifest_path, read_manifest
     from wbc_bench.protocol import find_protocol
@@ -88,12 +90,9 @@ def _evaluation(spec: str, settings: Settings, episodes: int) -> float:
     protocol, path = find_protocol(settings.protocol)
     manifest, _ = read_manifest(protocol, manifest_path(path))
     rows = manifest.of_replicate(0, episodes)
-    torch.set_num_threads(1)
     begun, before = time.perf_counter(), EngineClock.seconds
     evaluate_shard(spec, protocol, rows)
-    share = (EngineClock.seconds - before) / (time.perf_counter() - begun)
-    torch.set_num_threads(settings.threads)
-    return share
+    return (EngineClock.seconds - before) / (time.perf_counter() - begun)
 
 
 @contextmanager
