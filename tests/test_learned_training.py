@@ -434,6 +434,18 @@ def test_a_changed_run_keeps_what_it_has_learned(tmp_path):
     assert [r["samples"] for r in folder.read_metrics()] == [STEPS, 2 * STEPS, 2 * STEPS + 24]
     with pytest.raises(TrainingError, match=r"seed 0 -> 1; .*but for method, seed, protocol"):
         folder.open(replace(other, seed=1), change=True)
+    folder.claim.write_text("elsewhere 1")
+    files = folder.settings.read_bytes(), folder.changes.read_bytes()
+    with pytest.raises(TrainingError, match="is being trained by elsewhere"):
+        run(replace(other, gamma=0.9), folder, change=True)
+    assert files == (folder.settings.read_bytes(), folder.changes.read_bytes())
+
+
+def test_what_a_kill_has_lost_is_no_longer_read(tmp_path):
+    folder = RunFolder(tmp_path)
+    for iteration, samples in ((1, 10), (2, 20), (3, 30), (2, 15)):  # 2 and 3 came after the last resume file
+        folder.append({"iteration": iteration, "samples": samples})
+    assert [row["samples"] for row in folder.read_metrics()] == [10, 15]
 
 
 def test_a_damaged_resume_file_is_one_line(tmp_path):

@@ -33,7 +33,7 @@ class RunFolder:
 
     @property
     def metrics(self) -> Path:
-        """One JSON object an iteration; after a resume, the later line of an iteration counts."""
+        """One JSON object an iteration; a line after a resume replaces all from its iteration on."""
         return self.path / "metrics.jsonl"
 
     @property
@@ -87,14 +87,16 @@ class RunFolder:
         """Metrics by iteration; a line that a kill has cut short is left out."""
         if not self.metrics.exists():
             return []
-        rows = {}
+        rows: list[dict] = []
         for line in self.metrics.read_text().splitlines():
             try:
                 row = json.loads(line)
             except json.JSONDecodeError:
                 continue
-            rows[row["iteration"]] = row
-        return [rows[key] for key in sorted(rows)]
+            while rows and rows[-1]["iteration"] >= row["iteration"]:
+                rows.pop()  # lost in a kill, and trained again
+            rows.append(row)
+        return rows
 
     def append(self, row: dict) -> None:
         """Add one iteration's metrics."""
@@ -194,10 +196,10 @@ def run(
     from wbc_baselines.learned.training import Trainer, make_environment
 
     settings.check()
-    folder.open(settings, change)
     if not folder.take():
         raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
     try:
+        folder.open(settings, change)
         trainer = Trainer(settings, make_environment(settings))
         before = load_resume(trainer, folder)
         if not trainer.done:

@@ -7,7 +7,7 @@ from typing import Literal
 from wbc_baselines.learned.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
 
-FREE = frozenset({"budget", "threads"})  # settings that what a run learns does not depend on
+FREE = frozenset({"budget", "threads"})  # settings that may differ when a run goes on
 
 
 class TrainingError(BenchError):

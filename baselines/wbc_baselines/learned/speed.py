@@ -34,8 +34,9 @@ class EngineClock(mujoco.batch.Batch):
 
     def step(self, *arguments, **options):
         begun = time.perf_counter()
-        super().step(*arguments, **options)
+        found = super().step(*arguments, **options)
         EngineClock.seconds += time.perf_counter() - begun
+        return found
 
 
 def measure(
@@ -69,6 +70,7 @@ def measure(
         for _ in range(rounds):
             for method, name in ours.items():
                 evaluation[method].append(_evaluation(f"learned:{name}", settings, episodes))
+        torch.set_num_threads(settings.threads)
     return [
         Speed(
             method,
