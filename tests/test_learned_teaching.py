@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
 from learned import write  # noqa: E402
-from test_learned_training import TINY, assert_equal, trainer  # noqa: E402
+from test_learned_training import STEPS, TINY, assert_equal, trainer  # noqa: E402
 
 from wbc_baselines.learned import checkpoint, runs, teaching  # noqa: E402
 from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
@@ -26,7 +26,6 @@ from wbc_baselines.learned.teaching import (  # noqa: E402
 from wbc_baselines.learned.training import Trainer  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
-STEPS = TINY.envs * TINY.steps  # of an iteration
 REFERENCE = 57  # column of d_ref
 ROBOT = load_robot()
 

@@ -42,10 +42,9 @@ from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 from wbc_bench.rollout import evaluate  # noqa: E402
 
-STEPS = 8 * 6  # of an iteration
 TINY = Settings(
     "no_latent",
-    budget=4 * STEPS,
+    budget=4 * 8 * 6,
     envs=8,
     steps=6,
     minibatches=2,
@@ -60,6 +59,7 @@ TINY = Settings(
     calm=(0.0, 0.0),
     posture_teaching=(0.0, 0.0),
 )
+STEPS = TINY.envs * TINY.steps  # of an iteration
 
 
 def trainer(**changes) -> Trainer:

@@ -193,7 +193,7 @@ def run(
     Raises:
         TrainingError: see `RunFolder.open`, `load_resume`, `Trainer.iterate`; or another process has the run.
     """
-    from wbc_baselines.learned.training import Trainer, make_environment
+    from wbc_baselines.learned.training import Trainer, duration, make_environment
 
     settings.check()
     if not folder.take():
@@ -212,7 +212,7 @@ def run(
             while not trainer.done:
                 metrics = trainer.iterate()
                 seconds = time.monotonic() - started
-                rate = per_iteration / sum(metrics[f"time/{k}"] for k in ("rollout", "policy", "estimator"))
+                rate = per_iteration / duration(metrics)
                 row = {"iteration": trainer.iteration, "samples": trainer.samples, "seconds": seconds}
                 folder.append(row | {k: None if v != v else float(v) for k, v in metrics.items()})
                 if writer:

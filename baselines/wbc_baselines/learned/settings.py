@@ -115,9 +115,8 @@ class Settings:
     def changes(self, before: dict) -> dict[str, tuple[object, object]]:
         """Before and now, of what differs from a run's earlier settings and what it learns depends on."""
         before = asdict(Settings(self.method)) | before  # a setting newer than the run had its default
-        old, new = (
-            json.loads(json.dumps(settings)) for settings in (before, asdict(self))
-        )  # lists of tuples
+        # as they come back from a file: tuples become lists
+        old, new = (json.loads(json.dumps(settings)) for settings in (before, asdict(self)))
         return {
             name: (old[name], value) for name, value in new.items() if name not in FREE and old[name] != value
         }

@@ -12,6 +12,9 @@ import mujoco.batch
 import wbc_bench.simulation
 from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.settings import Settings
+from wbc_bench.execution import evaluate_shard
+from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.protocol import EvalProtocol, find_protocol
 
 ROUNDS = 5  # the first is warm-up; methods take turns, so that all meet the same machine
 EPISODES = 50  # of an evaluation, as many as in a shard
@@ -48,10 +51,12 @@ def measure(
     """
     import torch
 
-    from wbc_baselines.learned.training import Trainer, make_environment
+    from wbc_baselines.learned.training import Trainer, duration, make_environment
 
-    ours = {method: f"{method}@{settings.seed}" for method in methods}
-    ours = {method: name for method, name in ours.items() if name in checkpoint.available()}
+    available = checkpoint.available()
+    ours = {m: name for m in methods if (name := f"{m}@{settings.seed}") in available}
+    protocol, path = find_protocol(settings.protocol)
+    rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, episodes)
     control_steps = settings.envs * settings.steps
     training: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
     evaluation: dict[str, list[float]] = {method: [] for method in methods}
@@ -63,35 +68,27 @@ def measure(
         for _ in range(rounds):
             for trainer in trainers:
                 before = EngineClock.seconds
-                found = trainer.iterate()
-                whole = sum(found[f"time/{part}"] for part in ("rollout", "policy", "estimator"))
+                whole = duration(trainer.iterate())
                 training[trainer.settings.method].append((whole, EngineClock.seconds - before))
         torch.set_num_threads(1)
         for _ in range(rounds):
             for method, name in ours.items():
-                evaluation[method].append(_evaluation(f"learned:{name}", settings, episodes))
+                evaluation[method].append(_evaluation(f"learned:{name}", protocol, rows))
         torch.set_num_threads(settings.threads)
     return [
         Speed(
             method,
-            control_steps / median(whole for whole, _ in rows[1:]),
-            control_steps / median(engine for _, engine in rows[1:]),
-            median(engine / whole for whole, engine in rows[1:]),
+            control_steps / median(whole for whole, _ in times[1:]),
+            control_steps / median(engine for _, engine in times[1:]),
+            median(engine / whole for whole, engine in times[1:]),
             median(evaluation[method][1:]) if method in ours else None,
         )
-        for method, rows in training.items()
+        for method, times in training.items()
     ]
 
 
-def _evaluation(spec: str, settings: Settings, episodes: int) -> float:
-    """The engine's share of the time that the protocol's first episodes take, as one shard."""
-    from wbc_bench.execution import evaluate_shard
-    from wbc_bench.manifest import manifest_path, read_manifest
-    from wbc_bench.protocol import find_protocol
-
-    protocol, path = find_protocol(settings.protocol)
-    manifest, _ = read_manifest(protocol, manifest_path(path))
-    rows = manifest.of_replicate(0, episodes)
+def _evaluation(spec: str, protocol: EvalProtocol, rows: EpisodeManifest) -> float:
+    """The engine's share of the time that these episodes take, as one shard."""
     begun, before = time.perf_counter(), EngineClock.seconds
     evaluate_shard(spec, protocol, rows)
     return (EngineClock.seconds - before) / (time.perf_counter() - begun)

@@ -36,6 +36,8 @@ from wbc_baselines.learned.teaching import ArmTeaching, Fit, PostureTeaching, Te
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
+TIMES = ("time/rollout", "time/policy", "time/estimator")  # parts of an iteration, in its metrics
+
 
 def training_protocol(settings: Settings) -> EvalProtocol:
     """The protocol with the physics step and the pushes of training.
@@ -290,7 +292,7 @@ class Trainer:
                 "the last checkpoint is sound: resume with a smaller --learning-rate or another --seed"
             )
         seconds = [b - a for a, b in pairwise(clock)]
-        found |= dict(zip(("time/rollout", "time/policy", "time/estimator"), seconds, strict=True))
+        found |= dict(zip(TIMES, seconds, strict=True))
         found |= {
             "policy/std_legs": legs,
             "policy/std_arm": arm,
@@ -464,6 +466,11 @@ class Trainer:
         self._state_before = episodes["state_before"].to(self.device)
         if self._estimates:
             self._context = episodes["context"].to(self.device)
+
+
+def duration(metrics: dict[str, float]) -> float:
+    """Time [s] that the iteration of these metrics took."""
+    return sum(metrics[name] for name in TIMES)
 
 
 def advantages(
