@@ -103,7 +103,7 @@ def test_unwritable_results(capsys, tiny, tmp_path):
     file = tmp_path / "file"
     file.write_text("in the way")
     line = fails(capsys, "eval", "--controller", "hold", "--protocol", tiny, "--out", file / "results")
-    assert f"results folder '{file / 'results'}' cannot be written" in line
+    assert f"folder '{file / 'results'}' cannot be written" in line
 
 
 def test_wrong_shape_of_a_user_controller(capsys, tiny, tmp_path):

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from wbc_bench.controller import DEPLOYABLE, SIGNALS, controllers, load_controller
+from wbc_bench.controller import DEPLOYABLE, SIGNALS
 from wbc_bench.errors import ControllerError, UnknownNameError
+from wbc_bench.registry import controllers, load_controller
 from wbc_bench.robot import Robot, load_robot
 
 SOURCE = """

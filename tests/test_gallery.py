@@ -7,7 +7,7 @@ import pytest
 from synthetic import frame_of, record, study_store
 
 from wbc_bench import analysis, gallery
-from wbc_bench.episodes import Outcome
+from wbc_bench.outcomes import Outcome
 
 
 def method(frame, spec: str = "a:b") -> analysis.Evaluated:

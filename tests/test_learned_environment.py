@@ -28,10 +28,10 @@ from wbc_baselines.learned.starts import (  # noqa: E402
 )
 from wbc_baselines.learned.training import training_protocol  # noqa: E402
 from wbc_bench import randomization  # noqa: E402
-from wbc_bench.episodes import STRATA  # noqa: E402
 from wbc_bench.errors import ManifestError  # noqa: E402
 from wbc_bench.manifest import EpisodeManifest  # noqa: E402
 from wbc_bench.observation import Sensors  # noqa: E402
+from wbc_bench.outcomes import STRATA  # noqa: E402
 from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wbc_bench import metrics
-from wbc_bench.episodes import EpisodeBatch, Outcome
+from wbc_bench.outcomes import EpisodeBatch, Outcome
 
 PERIOD = 0.02  # [s]
 

@@ -13,7 +13,8 @@ import pytest
 
 from wbc_bench import store as store_module
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.store import ResultStore, RunKey, RunWriter, ShardCost, folder_name, write_atomic
+from wbc_bench.files import ensure_writable, folder_name, write_atomic
+from wbc_bench.store import ResultStore, RunKey, RunWriter, ShardCost
 
 FACTS = {
     **{"controller_name": "a", "signals": [], "source": "test", "checkpoint_sha256": None},
@@ -243,13 +244,13 @@ def test_a_really_full_disk(tmp_path):
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_probe_refuses_what_cannot_be_written(tmp_path):
+def test_ensure_writable_refuses_what_cannot_be_written(tmp_path):
     file = tmp_path / "file"
     file.write_text("")
     for root in (file, file / "below"):
-        with pytest.raises(StoreError, match="results folder"):
-            ResultStore(root).probe()
-    ResultStore(tmp_path / "new" / "folder").probe()
+        with pytest.raises(StoreError, match="cannot be written"):
+            ensure_writable(root)
+    ensure_writable(tmp_path / "new" / "folder")
     assert list((tmp_path / "new" / "folder").iterdir()) == []
 
 

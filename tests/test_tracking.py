@@ -11,8 +11,9 @@ from test_cli import fails
 
 from wbc_bench import plots
 from wbc_bench.cli import main
-from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target, load_controller
+from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.errors import StoreError
+from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz

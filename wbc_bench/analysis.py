@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wbc_bench.episodes import STRATA, TERMINATED
 from wbc_bench.errors import StoreError
+from wbc_bench.outcomes import STRATA, TERMINATED
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -68,6 +68,7 @@ class _Evaluation:
     ) -> "ResultStore":
         """Check everything, then run; with `optional`, what cannot be loaded is skipped with a line."""
         from wbc_bench.execution import Job, run_jobs
+        from wbc_bench.files import ensure_writable
         from wbc_bench.manifest import manifest_path, read_manifest
         from wbc_bench.protocol import find_protocol
         from wbc_bench.robot import load_robot
@@ -88,7 +89,7 @@ class _Evaluation:
             for spec in dict.fromkeys(specs)
         }
         store = ResultStore(self.out)
-        store.probe()
+        ensure_writable(self.out)
         jobs = [
             Job(protocol, manifest, sha256, spec, replicates, episodes)
             for spec, replicates in found.items()
@@ -198,12 +199,12 @@ class Track:
     """Folder of records, table and figure."""
 
     def run(self) -> None:
-        from wbc_bench.controller import load_controller
+        from wbc_bench.files import ensure_writable
         from wbc_bench.publish import publish_tracks
+        from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.library import check_source
         from wbc_bench.sources.live import LIVE
-        from wbc_bench.store import ResultStore
         from wbc_bench.track import CONDITIONS
         from wbc_bench.tracking import read_tracks, tracking_table, write_track
 
@@ -218,7 +219,7 @@ class Track:
             check_source(name)
         for spec in self.controller:
             load_controller(spec, load_robot())
-        ResultStore(self.out).probe()
+        ensure_writable(self.out)
         for name in dict.fromkeys(self.source):
             for spec in dict.fromkeys(self.controller):
                 tracked, facts = self._drag(spec) if name == LIVE else self._play(name, spec)
@@ -229,8 +230,8 @@ class Track:
 
     def _play(self, name: str, spec: str) -> "tuple[Tracked, dict]":
         """Let a controller follow a source of a name; the series, and what the record says beside it."""
-        from wbc_bench.controller import load_controller
         from wbc_bench.errors import SourceError
+        from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.library import load_source
         from wbc_bench.track import door_protocol, facts, track
@@ -316,9 +317,9 @@ class _Again:
 
     def _check_folder(self, path: Path) -> None:
         """Before minutes are spent on what cannot be written."""
-        from wbc_bench.store import ResultStore
+        from wbc_bench.files import ensure_writable
 
-        ResultStore(path.parent).probe()
+        ensure_writable(path.parent)
 
 
 @dataclass(frozen=True)
@@ -362,8 +363,9 @@ class Film(_Again):
                 f"MuJoCo cannot draw with MUJOCO_GL={chosen} ({error}): install it or unset that"
             ) from error
 
+        from wbc_bench.files import write_atomic
         from wbc_bench.progress import Progress
-        from wbc_bench.store import ResultStore, write_atomic
+        from wbc_bench.store import ResultStore
         from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
         from wbc_bench.viewer.rerun import rerun
 
@@ -406,12 +408,13 @@ class Compare:
 
     def run(self) -> None:
         from wbc_bench import tables
+        from wbc_bench.files import ensure_writable
         from wbc_bench.store import ResultStore
 
         store = ResultStore(self.results)
         _print_table(tables.compare_table(store, self.protocol, self.a, self.b))
         if self.out:
-            ResultStore(self.out).probe()
+            ensure_writable(self.out)
             tables.write_compare(store, self.protocol, self.a, self.b, self.out)
 
 
@@ -450,13 +453,13 @@ class Latent:
     """Folder of the figure and its numbers; a report beside it shows them."""
 
     def run(self) -> None:
-        from wbc_bench.controller import load_controller, spec_of_replicate
+        from wbc_bench.files import ensure_writable
         from wbc_bench.introspection import sample_latents
         from wbc_bench.latents import LEAST_EPISODES, summary, write_latents
         from wbc_bench.manifest import manifest_path, read_manifest
         from wbc_bench.protocol import find_protocol
+        from wbc_bench.registry import load_controller, spec_of_replicate
         from wbc_bench.robot import load_robot
-        from wbc_bench.store import ResultStore
 
         protocol, path = find_protocol(self.protocol)
         most = protocol.episodes.per_replicate
@@ -469,7 +472,7 @@ class Latent:
         controller = load_controller(spec, load_robot(protocol.robot))
         rows = manifest.of_replicate(0, self.episodes)
         samples = sample_latents(controller, protocol, rows)
-        ResultStore(self.out).probe()
+        ensure_writable(self.out)
         found, paths = write_latents(controller.info.name, protocol.name, samples, self.seed, self.out)
         print(*summary(samples, found), *paths, sep="\n")
 
@@ -494,10 +497,10 @@ class List:
                 _print_table(Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()())))
             return
 
-        from wbc_bench.controller import controllers
         from wbc_bench.manifest import manifest_path
         from wbc_bench.metrics import METRICS
         from wbc_bench.protocol import find_protocol, protocol_names
+        from wbc_bench.registry import controllers
         from wbc_bench.sources.library import find_script, script_names
         from wbc_bench.store import ResultStore
 
@@ -561,10 +564,11 @@ class ExportController:
     """Protocol whose robot it drives."""
 
     def run(self) -> None:
-        from wbc_bench.controller import Exportable, load_controller
+        from wbc_bench.controller import Exportable
+        from wbc_bench.files import ensure_writable, folder_name
         from wbc_bench.protocol import find_protocol
+        from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
-        from wbc_bench.store import ResultStore, folder_name
 
         robot = load_robot(find_protocol(self.protocol)[0].robot)
         controller = load_controller(self.controller, robot)
@@ -572,7 +576,7 @@ class ExportController:
         if not isinstance(controller, Exportable) or self.format not in formats:
             raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
         path = self.out or Path(f"{folder_name(self.controller)}.{self.format}")
-        ResultStore(path.parent).probe()
+        ensure_writable(path.parent)
         controller.export(path, self.format)
         print(path)
 
@@ -634,11 +638,11 @@ class Show:
     def run(self) -> None:
         import msgspec
 
+        from wbc_bench.files import ensure_writable
         from wbc_bench.manifest import manifest_path, read_manifest
         from wbc_bench.plots import write_targets
         from wbc_bench.protocol import find_protocol
         from wbc_bench.publish import target_frame
-        from wbc_bench.store import ResultStore
 
         protocol, path = find_protocol(self.name)
         print(f"# digest {protocol.digest}")
@@ -646,7 +650,7 @@ class Show:
         manifest, sha256 = read_manifest(protocol, manifest_path(path))
         print(f"# manifest sha256 {sha256}")
         print(target_frame(manifest).groupby("stratum").describe().T.to_string())
-        ResultStore(self.out).probe()
+        ensure_writable(self.out)
         for picture in write_targets(target_frame(manifest), protocol.name, self.out):
             print(picture)
 
@@ -674,11 +678,11 @@ class Export(_Robot):
     """Folder to write to."""
 
     def run(self) -> None:
+        from wbc_bench.files import ensure_writable, write_atomic
         from wbc_bench.robot import build_spec, load_robot
-        from wbc_bench.store import ResultStore, write_atomic
 
         robot = load_robot(self._config())
-        ResultStore(self.out).probe()
+        ensure_writable(self.out)
         spec = build_spec(robot.facts, robot.config)
         spec.compile()  # to_xml writes what was compiled
         for suffix, text in (("xml", spec.to_xml()), ("urdf", robot.urdf())):
@@ -695,12 +699,12 @@ class Picture(_Robot):
     """Picture to write."""
 
     def run(self) -> None:
+        from wbc_bench.files import ensure_writable
         from wbc_bench.robot import load_robot
         from wbc_bench.robot.picture import render
-        from wbc_bench.store import ResultStore
 
         robot = load_robot(self._config())
-        ResultStore(self.out.parent).probe()
+        ensure_writable(self.out.parent)
         render(robot, self.out)
         print(self.out)
 
@@ -717,15 +721,15 @@ class Bench:
     def run(self) -> None:
         from importlib.metadata import entry_points
 
+        from wbc_bench.files import ensure_writable
         from wbc_bench.markup import Table
-        from wbc_bench.store import ResultStore
 
         found = {point.name: point for point in entry_points(group=BENCHMARKS)}
         for name in self.names:
             if name not in found:
                 raise UnknownNameError("benchmark", name, found, f"entry points of '{BENCHMARKS}'")
         if self.out:
-            ResultStore(self.out).probe()
+            ensure_writable(self.out)
         for name in self.names or sorted(found):
             frame = found[name].load()()
             cells = [
@@ -754,13 +758,13 @@ class DemoRecord:
 
     def run(self) -> None:
         from wbc_bench.demo import record
+        from wbc_bench.files import ensure_writable
         from wbc_bench.progress import Progress
-        from wbc_bench.store import ResultStore
 
         _at_least_one("--episodes", self.episodes)
         _at_least_one("--workers", self.workers)
         _not_negative("--seed", self.seed)
-        ResultStore(self.out.parent).probe()
+        ensure_writable(self.out.parent)
         with Progress("episodes") as progress:
             kept = record(self.out, self.controller, self.seed, self.episodes, self.workers, progress.update)
         print(f"{self.out}: {kept} of {self.episodes} episodes closed their door and are kept")
@@ -783,8 +787,8 @@ class DemoTrain:
         import time
 
         from wbc_bench.errors import SourceError
+        from wbc_bench.files import ensure_writable
         from wbc_bench.progress import Progress
-        from wbc_bench.store import ResultStore
 
         try:
             from wbc_bench.sources.diffusion.policy import save_policy
@@ -796,7 +800,7 @@ class DemoTrain:
 
         _at_least_one("--updates", self.updates)
         _not_negative("--seed", self.seed)
-        ResultStore(self.out.parent).probe()
+        ensure_writable(self.out.parent)
         start = time.monotonic()
         with Progress("updates") as progress:
             policy, card = train(
@@ -926,7 +930,7 @@ def _within(option: str, value: int | None, most: int, what: str) -> int:
 
 def _loadable(spec: str, replicates: range, robot: "Robot", optional: bool) -> list[int]:
     """Replicates whose controller can be loaded; with `optional` the others are skipped with a line."""
-    from wbc_bench.controller import load_controller, spec_of_replicate
+    from wbc_bench.registry import load_controller, spec_of_replicate
 
     found: list[int] = []
     problems: dict[str, str] = {}  # spec of a replicate -> why not

@@ -10,9 +10,11 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from wbc_bench import provenance
-from wbc_bench.controller import Controller, load_controller
+from wbc_bench.controller import Controller
 from wbc_bench.door_records import write_doors
 from wbc_bench.errors import SourceError
+from wbc_bench.files import ensure_writable
+from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 from wbc_bench.sources.diffusion.demonstrations import Demonstration, write_demonstrations
 from wbc_bench.sources.diffusion.expert import ExpertSource
@@ -20,7 +22,6 @@ from wbc_bench.sources.diffusion.scene import CLOSED, Door, draw_door
 from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.library import find_policy
 from wbc_bench.sources.slew import Pose
-from wbc_bench.store import ResultStore
 from wbc_bench.track import Moment, door_protocol, episode_of, follow
 from wbc_bench.tracking import STOOD
 
@@ -117,7 +118,7 @@ def evaluate(
                 f"seed {seed}: the policy was trained on these doors, valid: any other than {seed}"
             )
     controller = load_controller(spec, load_robot())
-    ResultStore(root).probe()
+    ensure_writable(root)
     episodes = list(_run_all(policy, spec, condition, seed, count, workers, progress))
     return write_doors(
         root,

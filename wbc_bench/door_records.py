@@ -12,11 +12,10 @@ import pandas as pd
 import pyarrow as pa
 
 from wbc_bench import stats
+from wbc_bench.formatting import DEG, number_text
 from wbc_bench.markup import Table
 from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
-from wbc_bench.tracking import DEG, STOOD
-
-NONE = "–"
+from wbc_bench.tracking import STOOD
 
 
 class DoorRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -106,7 +105,7 @@ def door_table(runs: list[DoorRun]) -> Table:
                 f"{record.successes}/{record.completed}",
                 f"{rate.low * 100:.1f} to {rate.high * 100:.1f}",
                 str(falls),
-                *(_cell(value, 1) for value in (final.median(), final.max(), took.median())),
+                *(number_text(value, 1) for value in (final.median(), final.max(), took.median())),
             )
         )
         data.append(
@@ -131,7 +130,3 @@ def door_table(runs: list[DoorRun]) -> Table:
         for angle, duration in sorted({(run.record.closed_below, run.record.duration) for run in runs})
     ]
     return Table("doors", "Doors pushed shut", header, tuple(rows), tuple(notes), pd.DataFrame(data))
-
-
-def _cell(value: float, digits: int) -> str:
-    return NONE if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")

@@ -22,12 +22,13 @@ import numpy as np
 import pyarrow as pa
 
 from wbc_bench import metrics, provenance
-from wbc_bench.controller import Controller, load_controller, spec_of_replicate
-from wbc_bench.episodes import EpisodeBatch
+from wbc_bench.controller import Controller
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.outcomes import EpisodeBatch
 from wbc_bench.progress import Progress
 from wbc_bench.protocol import EvalProtocol
+from wbc_bench.registry import load_controller, spec_of_replicate
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.store import ResultStore, Run, RunKey, RunWriter, ShardCost

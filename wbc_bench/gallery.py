@@ -7,9 +7,9 @@ import numpy as np
 import pandas as pd
 
 from wbc_bench.analysis import ANGLE_TOLERANCE, REACH_TOLERANCE, Evaluated, FloatArray, column, subset
-from wbc_bench.episodes import TERMINATED, Outcome
-from wbc_bench.store import folder_name
-from wbc_bench.tables import CM, DEG
+from wbc_bench.files import folder_name
+from wbc_bench.formatting import CM, DEG, number_text
+from wbc_bench.outcomes import TERMINATED, Outcome
 
 SHOWN = 10  # episodes an outcome
 RULE = (
@@ -70,10 +70,10 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
                 *(str(row[kind]) for kind in kinds),
             )
             values = (
-                *(_number(row[key], 1.0, 2) for key in ("target_x", "target_y", "height")),
-                _number(row["position_error"], CM, 1),
-                _number(row["orientation_error"], DEG, 1),
-                _number(row["duration"], 1.0, 2),
+                *(number_text(row[key], 2) for key in ("target_x", "target_y", "height")),
+                number_text(row["position_error"] * CM, 1),
+                number_text(row["orientation_error"] * DEG, 1),
+                number_text(row["duration"], 2),
             )
             text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
             text += "".join(f'<td class="number">{value}</td>' for value in values)
@@ -101,7 +101,3 @@ def _replay(where: tuple[str, str, int, int], beside: Path) -> str:
 def _run(protocol: str, controller: str, replicate: int) -> str:
     """A run as `wbc-bench replay` takes it."""
     return f"{folder_name(protocol)}/{folder_name(controller)}/replicate_{replicate}"
-
-
-def _number(value: float, scale: float, digits: int) -> str:
-    return "–" if np.isnan(value) else f"{value * scale:.{digits}f}".replace("-", "−")

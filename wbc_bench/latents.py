@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from wbc_bench import stats
 from wbc_bench.analysis import REACH_TOLERANCE, FloatArray
 from wbc_bench.errors import BenchError
+from wbc_bench.files import folder_name, write_atomic
+from wbc_bench.formatting import CM
 from wbc_bench.plots import BLUE, ORANGE, VERMILION, save, styled
-from wbc_bench.store import folder_name, write_atomic
-from wbc_bench.tables import CM
 
 IntArray = NDArray[np.int64]
 

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.episodes import EpisodeBatch, Outcome
+from wbc_bench.outcomes import EpisodeBatch, Outcome
 
 FloatArray = NDArray[np.float64]
 

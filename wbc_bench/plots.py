@@ -33,9 +33,10 @@ from wbc_bench.analysis import (
     subset,
     variants,
 )
-from wbc_bench.episodes import Outcome
-from wbc_bench.store import folder_name
-from wbc_bench.tables import CM, DEG, Study, methods_of
+from wbc_bench.files import folder_name
+from wbc_bench.formatting import CM, DEG
+from wbc_bench.outcomes import Outcome
+from wbc_bench.tables import Study, methods_of
 from wbc_bench.tracking import STOOD, Track
 
 STYLE = Path(__file__).with_name("wbc.mplstyle")

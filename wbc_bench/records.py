@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from wbc_bench.errors import StoreError
-from wbc_bench.store import folder_name, write_atomic
+from wbc_bench.files import folder_name, write_atomic
 
 
 class Driven(Protocol):

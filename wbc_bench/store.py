@@ -21,8 +21,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from wbc_bench.episodes import Outcome
 from wbc_bench.errors import StoreError, UnknownNameError
+from wbc_bench.files import folder_name, write_atomic
+from wbc_bench.outcomes import Outcome
 
 LABELS = ("stratum", "condition", "orientation", "outcome")  # few values: dictionary-encoded
 
@@ -109,19 +110,6 @@ class ResultStore:
 
     def __init__(self, root: Path | str) -> None:
         self.root = Path(root)
-
-    def probe(self) -> None:
-        """Create the folder and write to it.
-
-        Raises: StoreError when that fails; permission bits alone do not tell (root, read-only mounts).
-        """
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StoreError(f"results folder '{self.root}' cannot be written: {error.strerror}") from error
-        probe = self.root / f".probe-{os.getpid()}"
-        write_atomic(probe, b"probe")
-        probe.unlink()
 
     def runs(self, protocol: str | None = None) -> list[Run]:
         """Finished runs, sorted by folder, i.e. protocol, controller, replicate."""
@@ -307,32 +295,6 @@ class RunWriter:
             self._shards.rmdir()
 
 
-def folder_name(name: str) -> str:
-    """A protocol or controller spec as a folder name."""
-    return "".join(c if c.isascii() and (c.isalnum() or c in "._@-") else "-" for c in name).strip("-.")
-
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Write a file that is afterwards either whole or not there, even after a power cut.
-
-    Raises: StoreError when the disk is full or the folder cannot be written; nothing is left behind.
-    """
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        with contextlib.suppress(OSError):  # where not even that is possible, it was never made
-            part.unlink()
-        raise StoreError(
-            f"cannot write '{path}': {error.strerror}; whatever was finished before is kept"
-        ) from error
-
-
 def _parquet(table: pa.Table, facts: Mapping[str, str | bytes], checksum: bool = False) -> bytes:
     sink = pa.BufferOutputStream()
     table = table.replace_schema_metadata(dict(facts))
@@ -380,11 +342,3 @@ def _remove_files(folder: Path) -> None:
 def _files(folder: Path) -> Iterator[Path]:
     # The record goes first: what is left of a half-removed run must not look finished.
     yield from sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.name != "run.json")
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -32,15 +32,13 @@ from wbc_bench.analysis import (
     variants,
 )
 from wbc_bench.analysis import column as series
-from wbc_bench.episodes import Outcome
 from wbc_bench.errors import UnknownNameError
+from wbc_bench.files import folder_name
+from wbc_bench.formatting import CM, DEG, NONE, interval_text, number_text, p_value_text, spread_text
 from wbc_bench.markup import Table
-from wbc_bench.store import folder_name
+from wbc_bench.outcomes import Outcome
 
 BOOTSTRAP_SEED = 0
-CM = 100.0  # [cm/m]
-DEG = 180.0 / np.pi  # [deg/rad]
-NONE = "–"  # an undefined value
 
 
 class Row(NamedTuple):
@@ -101,27 +99,6 @@ def study_rows(study: Study, evaluated: dict[str, Evaluated]) -> list[Row]:
 
 
 # --- cells --------------------------------------------------------------------------------------------
-
-
-def _spread(value: stats.Spread, digits: int) -> str:
-    if np.isnan(value.mean):
-        return NONE
-    return f"{value.mean:.{digits}f}" + ("" if np.isnan(value.sd) else f" ± {value.sd:.{digits}f}")
-
-
-def _interval(value: stats.Estimate, scale: float, digits: int, sign: str = "") -> str:
-    if np.isnan(value.point):
-        return NONE
-    point, low, high = (f"{x * scale:{sign}.{digits}f}" for x in (value.point, value.low, value.high))
-    return f"{point} [{low}, {high}]".replace("-", "−")
-
-
-def _p_value(p: float) -> str:
-    return NONE if np.isnan(p) else "<0.001" if p < 0.001 else f"{p:.3f}"
-
-
-def _number(value: float, digits: int) -> str:
-    return NONE if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
 # --- the paper's table --------------------------------------------------------------------------------
@@ -210,14 +187,14 @@ def paper_table(store: StoreLike, study: Study, terminated: bool = False) -> Tab
                 marks[row.label] = ", ".join(method.extra_signals)
             label = row.label + (" †" if method.extra_signals else "")
             count = defined(method, over)
-            cells = (_spread(values[column.name], column.digits) for column in COLUMNS)
+            cells = (spread_text(values[column.name], column.digits) for column in COLUMNS)
             rows.append((group, label, method.counts, str(count), *cells))
             counts = {"completed": method.completed, "requested": method.requested, "errors_over": count}
             counts["replicates"] = len(method.records)
             data.append({**base, "source": "measured", "note": "", **counts, **_flat(values)})
         printed = None if terminated else paper_columns(row.spec)
         if printed:
-            cells = (_spread(printed[column.name], column.digits) for column in COLUMNS)
+            cells = (spread_text(printed[column.name], column.digits) for column in COLUMNS)
             rows.append(("", "(paper)", "3000/3000", NONE, *cells))
             data.append({**base, "source": "paper", "note": "", **_flat(printed)})
     header = ("Study", "Method", "Episodes", "Errors over", *(column.header for column in COLUMNS))
@@ -308,7 +285,7 @@ def outcome_table(store: StoreLike, study: Study) -> Table:
             rate = stats.wilson(counts[Outcome.SUCCESS], len(outcome), len(method.records))
             cells = (str(count) for count in counts.values())
             total = method.counts if stratum == "all" else str(len(outcome))
-            rows.append((label if k == 0 else "", stratum, total, _interval(rate, 100.0, 1), *cells))
+            rows.append((label if k == 0 else "", stratum, total, interval_text(rate, 100.0, 1), *cells))
             data.append(
                 {
                     **{"controller": method.spec, "stratum": stratum, "episodes": len(outcome)},
@@ -339,7 +316,7 @@ def stratum_table(store: StoreLike, study: Study) -> Table:
                 count = defined(method, over & mask)
                 values = columns_over_replicates(method, over, mask)
                 name = "all" if terminated else "not terminated"
-                cells = (_spread(values[column.name], column.digits) for column in COLUMNS)
+                cells = (spread_text(values[column.name], column.digits) for column in COLUMNS)
                 first = (label if k == 0 else "", stratum) if not terminated else ("", "")
                 rows.append((*first, f"{count} {name}", *cells))
                 base = {"controller": method.spec, "stratum": stratum, "over": name, "errors_over": count}
@@ -410,7 +387,7 @@ def _compare_table(name: str, title: str, first: str, results: list[dict[str, An
         cells, flat = [], {}
         for metric, unit, scale, digits in DIFFERENCES:
             estimate, p = result[metric], result["p_holm"][metric]
-            cells += [_interval(estimate, scale, digits, "+"), _p_value(p)]
+            cells += [interval_text(estimate, scale, digits, "+"), p_value_text(p)]
             values = zip(("diff", "low", "high"), estimate[:3], strict=True)
             flat |= {f"{metric}_{part}_{unit}": value * scale for part, value in values}
             flat |= {f"{metric}_p": result["p"][metric], f"{metric}_p_holm": p}
@@ -491,8 +468,8 @@ def reach_table(store: StoreLike, protocol: str) -> Table:
                 (
                     *(spec if k == 0 else "", condition, orientation, total),
                     *(_range(span), f"{span.reached}/{len(by_height(episodes))}", _range(strict)),
-                    " / ".join(_number(value * CM, 1) for value in speed),
-                    " / ".join(_number(value, 2) for value in sparc),
+                    " / ".join(number_text(value * CM, 1) for value in speed),
+                    " / ".join(number_text(value, 2) for value in sparc),
                 )
             )
             zones = ("low_end", "middle", "high_end")
@@ -543,7 +520,7 @@ def height_table(protocol: str, method: Evaluated) -> Table:
             terminated = len(episodes) - len(kept)
             cells += [
                 f"{rate.point * 100:.0f} [{rate.low * 100:.0f}, {rate.high * 100:.0f}]",
-                _number(error * CM, 1) + (f" ({terminated})" if terminated else ""),
+                number_text(error * CM, 1) + (f" ({terminated})" if terminated else ""),
             ]
             data.append(
                 {

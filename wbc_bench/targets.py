@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.episodes import STRATA
 from wbc_bench.errors import ProtocolError
+from wbc_bench.outcomes import STRATA
 from wbc_bench.posture import Stance, StaticSolver, Witness, out_of_stance, static_solver
 from wbc_bench.protocol import EvalProtocol, ReachTargets, WorkspaceTargets
 from wbc_bench.randomness import stream

@@ -13,6 +13,7 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from wbc_bench.formatting import CM, DEG, NONE, number_text
 from wbc_bench.markup import Table
 from wbc_bench.metrics import spectral_arc_length
 from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 STOOD = "stood"  # the outcome of a run to its end; otherwise one of episodes.TERMINATED
 MAX_LAG = 3.0  # [s] a longer one is not following
 FOLLOWS = 0.5  # of the target's variance that the hand must repeat for its lag to mean anything; choice
-CM, DEG = 100.0, 180.0 / np.pi  # [cm/m], [deg/rad]
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,6 @@ COLUMNS = (  # header, score, scale, digits
     ("SPARC ↑", "sparc", 1.0, 1),
     ("SPARC of target", "target_sparc", 1.0, 1),
 )
-NONE = "–"
 
 
 def tracking_table(tracks: list[Track]) -> Table:
@@ -255,7 +254,7 @@ def tracking_table(tracks: list[Track]) -> Table:
         completed, requested = (
             sum(getattr(run.record, f"{what}_s") for run in runs) for what in ("completed", "requested")
         )
-        cells = (_cell(values[name] * scale, digits) for _, name, scale, digits in COLUMNS)
+        cells = (number_text(values[name] * scale, digits) for _, name, scale, digits in COLUMNS)
         counts = f"{stood}/{len(runs)}", f"{completed:.1f}/{requested:.1f}"
         rows.append((source if source != before else "", f"`{controller}`", condition, *counts, *cells))
         before = source
@@ -281,7 +280,3 @@ def tracking_table(tracks: list[Track]) -> Table:
 def _mean(values: list[float]) -> float:
     known = [value for value in values if not np.isnan(value)]
     return float(np.mean(known)) if known else np.nan
-
-
-def _cell(value: float, digits: int) -> str:
-    return NONE if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wbc_bench.store import Run, write_atomic
-from wbc_bench.tables import CM, DEG
+from wbc_bench.files import write_atomic
+from wbc_bench.formatting import CM, DEG
+from wbc_bench.store import Run
 from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress, rerun
 from wbc_bench.viewer.scene import Scene, serving
 

@@ -21,8 +21,8 @@ from wbc_baselines.learned.controller import LearnedController
 from wbc_baselines.learned.estimators import make_estimator
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Policy, flow_of
+from wbc_bench.files import write_atomic
 from wbc_bench.robot import Robot
-from wbc_bench.store import write_atomic
 
 OPSET = 17
 CARD = "card"  # key of the metadata

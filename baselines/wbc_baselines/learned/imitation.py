@@ -32,12 +32,12 @@ from wbc_bench.controller import (
     Observation,
     ProtocolAware,
     Target,
-    load_controller,
 )
-from wbc_bench.episodes import STRATA
 from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.outcomes import STRATA
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.randomness import stream
+from wbc_bench.registry import load_controller
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot, load_robot
 
 METHOD = "no_latent"  # the one whose policy has no context

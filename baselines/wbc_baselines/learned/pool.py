@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
-from wbc_bench.episodes import STRATA
 from wbc_bench.errors import ManifestError, ProtocolError
+from wbc_bench.outcomes import STRATA
 from wbc_bench.protocol import EvalProtocol, WorkspaceTargets
 from wbc_bench.targets import draw_workspace_target
 

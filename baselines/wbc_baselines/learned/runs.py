@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wbc_baselines.learned.settings import Settings, TrainingError
-from wbc_bench.store import write_atomic
+from wbc_bench.files import write_atomic
 
 if TYPE_CHECKING:
     from wbc_baselines.learned.training import Trainer

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.errors import SourceError
+from wbc_bench.files import write_atomic
 from wbc_bench.rotations import matrix_from_rotvec, rotvec_from_matrix
 from wbc_bench.sources.diffusion import poses
 from wbc_bench.sources.slew import Pose
-from wbc_bench.store import write_atomic
 
 Array = NDArray[np.float64]
 GRIPPER_WIDTH = 0.078  # [m] between the fingers of the facts file, which do not move

@@ -14,11 +14,11 @@ from safetensors.torch import save as bytes_of
 from torch import Tensor, nn
 
 from wbc_bench.errors import SourceError
+from wbc_bench.files import write_atomic
 from wbc_bench.sources.diffusion import poses
 from wbc_bench.sources.diffusion.demonstrations import DOOR
 from wbc_bench.sources.diffusion.denoising import Denoiser, sample
 from wbc_bench.sources.slew import Pose
-from wbc_bench.store import write_atomic
 
 Array = NDArray[np.float64]
 FORMAT = 1

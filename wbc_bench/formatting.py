@@ -1,0 +1,30 @@
+"""How numbers stand in a cell: units, digits, minus signs, intervals; an undefined value is a dash."""
+
+import numpy as np
+
+from wbc_bench import stats
+
+CM = 100.0  # [cm/m]
+DEG = 180.0 / np.pi  # [deg/rad]
+NONE = "–"  # an undefined value
+
+
+def spread_text(value: stats.Spread, digits: int) -> str:
+    if np.isnan(value.mean):
+        return NONE
+    return f"{value.mean:.{digits}f}" + ("" if np.isnan(value.sd) else f" ± {value.sd:.{digits}f}")
+
+
+def interval_text(value: stats.Estimate, scale: float, digits: int, sign: str = "") -> str:
+    if np.isnan(value.point):
+        return NONE
+    point, low, high = (f"{x * scale:{sign}.{digits}f}" for x in (value.point, value.low, value.high))
+    return f"{point} [{low}, {high}]".replace("-", "−")
+
+
+def p_value_text(p: float) -> str:
+    return NONE if np.isnan(p) else "<0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def number_text(value: float, digits: int) -> str:
+    return NONE if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
