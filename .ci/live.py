@@ -14,12 +14,12 @@ import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed
 
-from wbc_bench.analysis import collect, stood
 from wbc_bench.execution import evaluate_shard
 from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.protocol import find_protocol
 from wbc_bench.registry import spec_of_replicate
-from wbc_bench.store import ResultStore
+from wbc_bench.results.analysis import collect, stood
+from wbc_bench.results.store import ResultStore
 
 EPISODES = 60
 EQUAL_OUTCOMES = 0.90
@@ -37,7 +37,7 @@ def main() -> int:
         protocol, path = find_protocol(name)
         manifest, sha256 = read_manifest(protocol, manifest_path(path))
         row_of = {key: row for row, key in enumerate(zip(manifest.replicate, manifest.episode, strict=True))}
-        for spec, method in collect(store, name).items():
+        for spec, method in collect(store.runs(name)).items():
             record = method.records[0]
             if (record.protocol_digest, record.manifest_sha256) != (protocol.digest, sha256):
                 print(f"FAILED {name} {spec}: the records answer another protocol or manifest")

@@ -6,8 +6,8 @@ import tempfile
 from pathlib import Path
 
 from wbc_bench.publish import publish
-from wbc_bench.report import GIVEN
-from wbc_bench.store import ResultStore
+from wbc_bench.results.report import GIVEN
+from wbc_bench.results.store import ResultStore
 
 
 def products(root: Path) -> dict[str, bytes]:

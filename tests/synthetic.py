@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
+from wbc_bench.results.analysis import Evaluated, collect
+
 STRATA = ("arm", "posture", "step")
 
 
@@ -25,6 +27,11 @@ class FakeStore:
 
     def runs(self, protocol: str | None = None) -> list[FakeRun]:
         return [run for run in self.all_runs if protocol in (None, run.record.protocol)]
+
+
+def methods_in(store: FakeStore, protocol: str = "ablation_v1") -> dict[str, Evaluated]:
+    """What the tables and figures of a protocol are made of."""
+    return collect(store.runs(protocol))
 
 
 def record(controller: str, replicate: int, frame: pd.DataFrame, **changes) -> SimpleNamespace:

@@ -6,52 +6,31 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"wbc_bench": ROOT / "wbc_bench", "wbc_baselines": ROOT / "baselines" / "wbc_baselines"}
 
-# From the table of contents of the design, top first: what stands below never imports what stands above.
-CHAINS = (
-    ("cli", "publish", "report", "tables", "analysis", "outcomes"),
-    ("cli", "publish", "report", "plots", "analysis", "outcomes"),
-    ("tables", "stats"),
-    ("publish", "workspace", "plots", "tables"),
-    ("publish", "report", "gallery", "tables"),
-    ("cli", "introspection", "latents", "plots", "tables"),
-    ("cli", "introspection", "control_loop", "observation"),
-    ("publish", "store", "outcomes"),
-    ("cli", "execution", "store"),
-    ("execution", "rollout", "simulation", "robot", "rotations"),
-    ("execution", "rollout", "controller", "robot", "errors"),
-    ("rollout", "observation", "protocol", "robot"),
-    ("freeze", "targets", "robot"),
-    ("freeze", "manifest", "protocol"),
-    ("execution", "metrics", "outcomes"),
-    ("cli", "track", "sources", "protocol", "robot"),
-    ("track", "control_loop", "observation"),
-    ("publish", "tracking", "records", "store"),
-    ("cli", "demo", "track", "sources"),
-    ("demo", "door_records", "records", "store"),
-    ("publish", "door_records", "stats"),
-)
-# Numbers are made of records alone: an analysis runs where neither physics nor learning is installed.
-PURE = (
-    "metrics",
-    "stats",
-    "store",
-    "analysis",
-    "markup",
-    "tables",
-    "plots",
-    "workspace",
-    "gallery",
-    "latents",
-    "report",
-    "outcomes",
-    "tracking",
-    "door_records",
-    "records",
+# Top first: what stands below never imports what stands above; neighbours in a line do not know each other.
+LAYERS = (
+    ("__main__",),
+    ("cli",),
+    ("publish", "viewer", "benchmark"),
+    ("demo",),
+    ("introspection", "track", "execution"),
+    ("rollout",),
+    ("control_loop",),
+    ("observation",),
+    ("simulation",),
+    ("registry",),
+    ("sources",),
+    ("controller",),
+    ("freeze",),
+    ("targets",),
+    ("manifest",),
+    ("randomization", "posture"),
+    ("protocol",),
+    ("robot", "results"),
+    ("provenance", "progress", "outcomes", "files", "schema"),
+    ("rotations", "randomness", "errors"),
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")
 
@@ -127,14 +106,17 @@ def test_baselines_do_not_know_each_other():
             assert not any(name.startswith("wbc_baselines.ik") for name in reaches(module)), module
 
 
-@pytest.mark.parametrize("chain", CHAINS, ids=" > ".join)
-def test_imports_point_down(chain):
-    for k, lower in enumerate(chain):
-        for module in (m for m in MODULES if m.startswith("wbc_bench.") and group(m) == lower):
-            above = {group(name) for name in reaches(module) if name.startswith("wbc_bench.")} & set(
-                chain[:k]
-            )
-            assert not above, f"{module} reaches {above}"
+def test_every_part_of_the_harness_has_a_layer():
+    parts = {group(module) for module in MODULES if module.startswith("wbc_bench.")}
+    listed = [part for layer in LAYERS for part in layer]
+    assert sorted(listed) == sorted(set(listed)) and parts == set(listed)
+
+
+def test_imports_point_down():
+    level = {part: k for k, layer in enumerate(LAYERS) for part in layer}
+    for module in (m for m in MODULES if m.startswith("wbc_bench.")):
+        for name in (n for n in imports(module) if n.startswith("wbc_bench.") and group(n) != group(module)):
+            assert level[group(module)] < level[group(name)], f"{module} imports {name}"
 
 
 def test_no_cycles():
@@ -145,10 +127,10 @@ def test_no_cycles():
                 assert module not in reaches(name), f"{module} and {name} import each other"
 
 
-@pytest.mark.parametrize("name", PURE)
-def test_analysis_needs_neither_physics_nor_learning(name):
-    if f"wbc_bench.{name}" in MODULES:
-        assert not reaches(f"wbc_bench.{name}") & set(HEAVY)
+def test_results_need_neither_physics_nor_learning():
+    """Numbers are made of records alone: an analysis runs where neither is installed."""
+    for module in (m for m in MODULES if m.startswith("wbc_bench.results")):
+        assert not reaches(module) & set(HEAVY), module
 
 
 def test_the_command_line_starts_light():

@@ -182,7 +182,7 @@ def test_eval_report_compare_list(capsys, tiny, tmp_path):
 
 
 def test_a_failing_report_leaves_the_old_one(capsys, tiny, tmp_path, monkeypatch):
-    from wbc_bench import report
+    from wbc_bench.results import report
 
     evaluate(tiny, tmp_path / "out")
     main(["report", "--results", str(tmp_path / "out")])

@@ -13,9 +13,9 @@ from test_cli import fails
 
 from wbc_bench import demo
 from wbc_bench.cli import main
-from wbc_bench.door_records import door_table, read_doors
 from wbc_bench.errors import SourceError, StoreError
 from wbc_bench.registry import load_controller
+from wbc_bench.results.doors import door_table, read_doors
 from wbc_bench.robot import build_spec, load_robot
 from wbc_bench.rotations import matrix_from_rotvec
 from wbc_bench.simulation import Simulation

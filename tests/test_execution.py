@@ -18,7 +18,7 @@ from wbc_bench.execution import Engine, ExecutionError, Job, evaluate_shard, run
 from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.outcomes import Outcome
 from wbc_bench.protocol import load_protocol
-from wbc_bench.store import ResultStore
+from wbc_bench.results.store import ResultStore
 
 EPISODES = 120  # three shards, the last one short
 
@@ -262,7 +262,7 @@ def test_changed_code_does_not_join_old_shards(tiny, tmp_path):
 
 
 def test_columns_of_the_record(tiny):
-    from wbc_bench.metrics import METRICS
+    from wbc_bench.results.metrics import METRICS
 
     protocol = load_protocol(tiny)
     manifest, _ = read_manifest(protocol, manifest_path(tiny))

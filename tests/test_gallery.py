@@ -4,10 +4,10 @@ import re
 
 import numpy as np
 import pytest
-from synthetic import frame_of, record, study_store
+from synthetic import frame_of, methods_in, record, study_store
 
-from wbc_bench import analysis, gallery
 from wbc_bench.outcomes import Outcome
+from wbc_bench.results import analysis, gallery
 
 
 def method(frame, spec: str = "a:b") -> analysis.Evaluated:
@@ -35,7 +35,7 @@ def test_equals_come_in_the_order_of_replicate_and_episode():
 
 
 def test_every_outcome_with_its_count_and_at_most_ten_rows(tmp_path):
-    one = analysis.collect(study_store(), "ablation_v1")["ik"]
+    one = methods_in(study_store())["ik"]
     text = gallery.gallery_html("ablation_v1", one, tmp_path)
     counts = one.episodes["outcome"].value_counts()
     rows = len(re.findall("<tr", text)) - 1

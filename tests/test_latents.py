@@ -6,8 +6,10 @@ import sys
 import numpy as np
 import pytest
 
-from wbc_bench import latents
-from wbc_bench.latents import LatentError, Samples
+from wbc_bench.results import latents
+from wbc_bench.results.figures import latents as latent_figures
+from wbc_bench.results.figures.latents import write_latents
+from wbc_bench.results.latents import LatentError, Samples
 
 
 def synthetic(
@@ -88,10 +90,10 @@ def test_without_scikit_learn_it_says_what_to_install(monkeypatch):
 
 @pytest.mark.parametrize("kinds", [2, 3])
 def test_same_samples_same_bytes(tmp_path, monkeypatch, kinds):
-    monkeypatch.setattr(latents, "DRAWN", 150)
+    monkeypatch.setattr(latent_figures, "DRAWN", 150)
     for folder in ("one", "two"):
         (tmp_path / folder).mkdir()
-        found, paths = latents.write_latents("a:b", "p", synthetic(3.0, kinds=kinds), 0, tmp_path / folder)
+        found, paths = write_latents("a:b", "p", synthetic(3.0, kinds=kinds), 0, tmp_path / folder)
     assert [path.name for path in paths] == [f"latent_a-b.{suffix}" for suffix in ("png", "svg", "json")]
     for path in paths:
         assert path.read_bytes() == (tmp_path / "one" / path.name).read_bytes()

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from wbc_bench import metrics
 from wbc_bench.outcomes import EpisodeBatch, Outcome
+from wbc_bench.results import metrics
 
 PERIOD = 0.02  # [s]
 

@@ -4,9 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from synthetic import FakeStore, reach_store, study_store
+from synthetic import FakeStore, methods_in, reach_store, study_store
 
-from wbc_bench import analysis, plots, tables
+from wbc_bench.results import analysis
+from wbc_bench.results.figures.reach import write_reach_figures
+from wbc_bench.results.figures.study import error_cdf, outcome_bars, success_by_stratum, write_study_figures
+from wbc_bench.results.figures.targets import write_targets
+from wbc_bench.results.study import ABLATION, methods_of
 
 
 def targets() -> pd.DataFrame:
@@ -17,13 +21,13 @@ def targets() -> pd.DataFrame:
 
 
 def methods() -> list[tuple[str, analysis.Evaluated]]:
-    return tables.methods_of(tables.ABLATION, analysis.collect(study_store(), "ablation_v1"))
+    return methods_of(ABLATION, methods_in(study_store()))
 
 
 def test_same_store_same_bytes(tmp_path):
     for folder in (tmp_path / "one", tmp_path / "two"):
-        plots.write_reach(reach_store(), "reach_v1", folder)
-        plots.write_targets(targets(), "ablation_v1", folder)
+        write_reach_figures("reach_v1", methods_in(reach_store(), "reach_v1"), folder)
+        write_targets(targets(), "ablation_v1", folder)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
     assert len(files) == 2 * 2
     for name in files:
@@ -32,7 +36,7 @@ def test_same_store_same_bytes(tmp_path):
 
 
 def test_files_of_a_study_carry_no_date_and_no_program(tmp_path):
-    paths = plots.write_study(study_store(), tables.ABLATION, tmp_path)
+    paths = write_study_figures(ABLATION, methods_in(study_store()), tmp_path)
     assert len(paths) == 2 * 3
     for path in paths:
         data = path.read_bytes()
@@ -40,23 +44,23 @@ def test_files_of_a_study_carry_no_date_and_no_program(tmp_path):
 
 
 def test_nothing_to_draw_writes_nothing(tmp_path):
-    assert plots.write_study(FakeStore([]), tables.ABLATION, tmp_path) == []
-    assert plots.write_reach(FakeStore([]), "reach_v1", tmp_path) == []
+    assert write_study_figures(ABLATION, methods_in(FakeStore([])), tmp_path) == []
+    assert write_reach_figures("reach_v1", methods_in(FakeStore([]), "reach_v1"), tmp_path) == []
 
 
 def test_a_plot_returns_its_axes():
     ax = Figure().subplots()
-    assert plots.success_by_stratum(ax, methods()) is ax
-    assert plots.outcome_bars(Figure().subplots(), methods()).get_title()
+    assert success_by_stratum(ax, methods()) is ax
+    assert outcome_bars(Figure().subplots(), methods()).get_title()
 
 
 def test_outcome_bars_add_up_to_100():
-    ax = plots.outcome_bars(Figure().subplots(), methods())
+    ax = outcome_bars(Figure().subplots(), methods())
     bars = [bar for container in ax.containers for bar in container]
     assert sum(bar.get_width() for bar in bars) == pytest.approx(100.0 * len(methods()))
 
 
 def test_a_cdf_ends_at_the_share_that_stood():
-    ax = plots.error_cdf(Figure().subplots(), methods(), "position_error")
+    ax = error_cdf(Figure().subplots(), methods(), "position_error")
     for line, (_, method) in zip(ax.get_lines(), methods(), strict=False):
         assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.stood.mean())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from wbc_bench import stats
+from wbc_bench.results import stats
 
 
 def rng(seed: int = 0) -> np.random.Generator:

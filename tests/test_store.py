@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from wbc_bench import store as store_module
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import ensure_writable, folder_name, write_atomic
-from wbc_bench.store import ResultStore, RunKey, RunWriter, ShardCost
+from wbc_bench.results import store as store_module
+from wbc_bench.results.store import ResultStore, RunKey, RunWriter, ShardCost
 
 FACTS = {
     **{"controller_name": "a", "signals": [], "source": "test", "checkpoint_sha256": None},

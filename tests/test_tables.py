@@ -3,11 +3,18 @@
 import numpy as np
 import pandas as pd
 import pytest
-from synthetic import FakeRun, FakeStore, frame_of, reach_store, record, study_store
+from synthetic import FakeRun, FakeStore, frame_of, methods_in, reach_store, record, study_store
 
-from wbc_bench import analysis, stats, tables
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.markup import read_markdown
+from wbc_bench.results import analysis, stats
+from wbc_bench.results.formatting import NONE
+from wbc_bench.results.study import ABLATION
+from wbc_bench.results.table import Table, read_markdown
+from wbc_bench.results.tables.pairs import compare_table, pair_table
+from wbc_bench.results.tables.paper import paper_table
+from wbc_bench.results.tables.reach import height_table, reach_table
+from wbc_bench.results.tables.strata import outcome_table
+from wbc_bench.results.tables.write import write_compare_table, write_reach_tables, write_study_tables
 
 
 @pytest.fixture(autouse=True)
@@ -30,13 +37,13 @@ def small_store() -> FakeStore:
     return FakeStore(runs)
 
 
-def cells(table: tables.Table, method: str) -> dict[str, str]:
+def cells(table: Table, method: str) -> dict[str, str]:
     row = next(row for row in table.rows if method in row)
     return dict(zip(table.header, row, strict=True))
 
 
 def test_the_papers_columns_by_hand():
-    row = cells(tables.paper_table(small_store(), tables.ABLATION), "Whole-body IK")
+    row = cells(paper_table(ABLATION, methods_in(small_store())), "Whole-body IK")
     assert row["Episodes"] == "8/8" and row["Errors over"] == "6"
     assert row["Success ↑ (%)"] == "50.00 ± 0.00"
     # Means without the fall: 8/3 cm and 4 cm; their deviation is half the difference times sqrt 2.
@@ -48,13 +55,13 @@ def test_the_papers_columns_by_hand():
 
 
 def test_falls_count_in_the_second_table():
-    row = cells(tables.paper_table(small_store(), tables.ABLATION, terminated=True), "Whole-body IK")
+    row = cells(paper_table(ABLATION, methods_in(small_store()), terminated=True), "Whole-body IK")
     assert row["Errors over"] == "8" and row["Success ↑ (%)"] == "50.00 ± 0.00"
     assert row["Pos. mean ↓ (cm)"].startswith(f"{(27 + 28) / 2:.2f}")
 
 
 def test_the_papers_numbers_stand_beside_ours_and_absence_has_a_reason():
-    table = tables.paper_table(small_store(), tables.ABLATION)
+    table = paper_table(ABLATION, methods_in(small_store()))
     k = next(k for k, row in enumerate(table.rows) if "Matched additive" in row)
     assert "not evaluated: no checkpoint" in table.rows[k]
     assert "82.73 ± 0.93" in table.rows[k + 1] and "14.35 ± 0.25" in table.rows[k + 1]
@@ -63,38 +70,38 @@ def test_the_papers_numbers_stand_beside_ours_and_absence_has_a_reason():
 
 def test_one_replicate_has_no_deviation():
     store = FakeStore(small_store().all_runs[:1])
-    assert cells(tables.paper_table(store, tables.ABLATION), "Whole-body IK")["Success ↑ (%)"] == "50.00"
+    assert cells(paper_table(ABLATION, methods_in(store)), "Whole-body IK")["Success ↑ (%)"] == "50.00"
 
 
 def test_missing_episodes_show():
     frame = frame_of(0, np.array(["success"] * 4, dtype=object))
     store = FakeStore([FakeRun(record("ik", 0, frame, requested=10), frame)])
-    assert cells(tables.paper_table(store, tables.ABLATION), "Whole-body IK")["Episodes"] == "4/10"
+    assert cells(paper_table(ABLATION, methods_in(store)), "Whole-body IK")["Episodes"] == "4/10"
 
 
 def test_a_method_that_always_falls_has_no_error_rather_than_zero():
     frame = frame_of(0, np.array(["fell"] * 4, dtype=object))
     store = FakeStore([FakeRun(record("ik", 0, frame), frame)])
-    row = cells(tables.paper_table(store, tables.ABLATION), "Whole-body IK")
-    assert row["Pos. mean ↓ (cm)"] == tables.NONE and row["Success ↑ (%)"] == "0.00"
+    row = cells(paper_table(ABLATION, methods_in(store)), "Whole-body IK")
+    assert row["Pos. mean ↓ (cm)"] == NONE and row["Success ↑ (%)"] == "0.00"
 
 
 def test_more_signals_than_the_paper_are_marked():
     frame = frame_of(0, np.array(["success"] * 4, dtype=object))
     signals = ["base_pose", "ee_pose", "proprioception"]
-    table = tables.paper_table(
-        FakeStore([FakeRun(record("ik", 0, frame, signals=signals), frame)]), tables.ABLATION
+    table = paper_table(
+        ABLATION, methods_in(FakeStore([FakeRun(record("ik", 0, frame, signals=signals), frame)]))
     )
     assert any("Whole-body IK †" in row for row in table.rows)
     assert any("Whole-body IK: base_pose" in note for note in table.notes)
-    assert not any("†" in note for note in tables.paper_table(small_store(), tables.ABLATION).notes)
+    assert not any("†" in note for note in paper_table(ABLATION, methods_in(small_store())).notes)
 
 
 def test_a_users_controller_joins_the_table():
     frame = frame_of(0, np.array(["success"] * 4, dtype=object))
     store = FakeStore([FakeRun(record("mine:Controller", 0, frame), frame)])
     assert any(
-        "Other" in row and "mine:Controller" in row for row in tables.paper_table(store, tables.ABLATION).rows
+        "Other" in row and "mine:Controller" in row for row in paper_table(ABLATION, methods_in(store)).rows
     )
 
 
@@ -103,11 +110,11 @@ def test_digests_are_not_mixed(changed):
     frame = frame_of(0, np.array(["success"] * 4, dtype=object))
     other = FakeRun(record("hold", 0, frame, **{changed: "f" * 64}), frame)
     with pytest.raises(StoreError, match="f" * 64):
-        tables.paper_table(FakeStore([*small_store().all_runs, other]), tables.ABLATION)
+        paper_table(ABLATION, methods_in(FakeStore([*small_store().all_runs, other])))
 
 
 def test_outcomes_add_up():
-    table = tables.outcome_table(study_store(), tables.ABLATION)
+    table = outcome_table(ABLATION, methods_in(study_store()))
     outcomes = [
         c for c in table.data if c not in ("controller", "stratum", "episodes", "success_rate", "low", "high")
     ]
@@ -118,11 +125,11 @@ def test_outcomes_add_up():
 
 
 def test_pairs_are_the_studys_own_and_use_the_same_episodes():
-    table = tables.pair_table(study_store(), tables.ABLATION)
+    table = pair_table(ABLATION, methods_in(study_store()))
     assert list(table.data["A vs B".lower()]) == ["ik vs hold", "ik vs ik:kinematic", "ik vs ik:osqp"]
     first = table.data.iloc[0]
     assert first["success_diff_pp"] > 0 and first["success_p_holm"] >= first["success_p"]
-    frames = [analysis.collect(study_store(), "ablation_v1")[spec].episodes for spec in ("ik", "hold")]
+    frames = [methods_in(study_store())[spec].episodes for spec in ("ik", "hold")]
     only = (frames[0]["success"] > frames[1]["success"]).sum()
     assert first["only_a"] == only
     # Two methods with the same outcome on every episode: nothing to tell apart.
@@ -131,14 +138,14 @@ def test_pairs_are_the_studys_own_and_use_the_same_episodes():
 
 
 def test_compare_needs_runs_of_both():
-    table = tables.compare_table(study_store(), "ablation_v1", "ik", "hold")
+    table = compare_table("ablation_v1", methods_in(study_store()), "ik", "hold")
     assert list(table.data["stratum"]) == ["arm", "posture", "step", "all"]
     with pytest.raises(UnknownNameError, match="nobody"):
-        tables.compare_table(study_store(), "ablation_v1", "ik", "nobody")
+        compare_table("ablation_v1", methods_in(study_store()), "ik", "nobody")
 
 
 def test_markdown_survives_a_round_trip(tmp_path):
-    table = tables.outcome_table(study_store(), tables.ABLATION)
+    table = outcome_table(ABLATION, methods_in(study_store()))
     table.write(tmp_path)
     back = read_markdown(tmp_path / f"{table.name}.md")
     assert (back.title, back.header, back.rows, back.notes) == (
@@ -150,7 +157,7 @@ def test_markdown_survives_a_round_trip(tmp_path):
 
 
 def test_latex_is_escaped_and_balanced():
-    text = tables.paper_table(study_store(), tables.ABLATION).latex()
+    text = paper_table(ABLATION, methods_in(study_store())).latex()
     body = text.replace(r"\%", "").replace(r"\_", "").replace(r"\&", "")
     assert "%" not in body and "±" not in text and "↑" not in text
     assert text.isascii()
@@ -161,9 +168,9 @@ def test_latex_is_escaped_and_balanced():
 
 def test_same_store_same_bytes(tmp_path):
     for name in ("one", "two"):
-        tables.write_study(study_store(count=30), tables.ABLATION, tmp_path / name)
-        tables.write_reach(reach_store(), "reach_v1", tmp_path / name)
-        tables.write_compare(study_store(), "ablation_v1", "ik", "ik:kinematic", tmp_path / name)
+        write_study_tables(ABLATION, methods_in(study_store(count=30)), tmp_path / name)
+        write_reach_tables("reach_v1", methods_in(reach_store(), "reach_v1"), tmp_path / name)
+        write_compare_table("ablation_v1", methods_in(study_store()), "ik", "ik:kinematic", tmp_path / name)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
     assert len(files) == 3 * (5 + 2 + 1)
     assert all((tmp_path / "one" / f).read_bytes() == (tmp_path / "two" / f).read_bytes() for f in files)
@@ -214,6 +221,6 @@ def test_oscillation_near_the_ends():
 
 
 def test_reach_table_has_the_papers_ranges_and_the_grid():
-    table = tables.reach_table(reach_store(), "reach_v1")
+    table = reach_table("reach_v1", methods_in(reach_store(), "reach_v1"))
     assert [row[4] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
-    assert len(tables.height_table("reach_v1", analysis.collect(reach_store(), "reach_v1")["ik"]).rows) == 41
+    assert len(height_table("reach_v1", methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41

@@ -9,17 +9,12 @@ import pytest
 import zmq
 from test_cli import fails
 
-from wbc_bench import plots
 from wbc_bench.cli import main
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.errors import StoreError
 from wbc_bench.registry import load_controller
-from wbc_bench.robot import load_robot
-from wbc_bench.rollout import evaluate
-from wbc_bench.rotations import matrix_from_wxyz
-from wbc_bench.sources import Seen, StampedTarget, load_source
-from wbc_bench.track import _protocol, _row, follow, natural_duration, track
-from wbc_bench.tracking import (
+from wbc_bench.results.figures.tracking import write_tracking
+from wbc_bench.results.tracking import (
     STOOD,
     Tracked,
     lag,
@@ -29,6 +24,11 @@ from wbc_bench.tracking import (
     tracking_table,
     write_track,
 )
+from wbc_bench.robot import load_robot
+from wbc_bench.rollout import evaluate
+from wbc_bench.rotations import matrix_from_wxyz
+from wbc_bench.sources import Seen, StampedTarget, load_source
+from wbc_bench.track import _protocol, _row, follow, natural_duration, track
 
 PERIOD = 0.02  # [s]
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -239,7 +239,7 @@ def test_the_figure_is_the_same_for_the_same_runs(tmp_path: Path) -> None:
     write_track(tmp_path, tracked(0.3), **FACTS)
     write_track(tmp_path, tracked(0.0, "fell", steps=50), **FACTS | {"controller": "hold"})
     write_track(tmp_path, tracked(0.5), **FACTS | {"source": "wipe_board", "condition": "randomised"})
-    one, two = (plots.write_tracking(read_tracks(tmp_path), tmp_path / name) for name in ("a", "b"))
+    one, two = (write_tracking(read_tracks(tmp_path), tmp_path / name) for name in ("a", "b"))
     assert [path.name for path in one] == ["tracking.png", "tracking.svg"]
     assert [path.read_bytes() for path in one] == [path.read_bytes() for path in two]
 

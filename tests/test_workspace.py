@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
-from synthetic import FakeRun, FakeStore, episodes, frame_of, record, study_store
+from synthetic import FakeRun, FakeStore, episodes, frame_of, methods_in, record, study_store
 
-from wbc_bench import analysis, tables, workspace
 from wbc_bench.errors import UnknownNameError
+from wbc_bench.results import analysis
+from wbc_bench.results.figures import workspace
+from wbc_bench.results.study import ABLATION, methods_of
 
 
 def method(frame) -> analysis.Evaluated:
@@ -58,7 +60,7 @@ def test_more_episodes_allow_finer_bins():
 
 
 def test_the_best_two_or_those_named():
-    methods = tables.methods_of(tables.ABLATION, analysis.collect(study_store(), "ablation_v1"))
+    methods = methods_of(ABLATION, methods_in(study_store()))
     assert {m.spec for _, m in workspace.best(methods)} == {"ik", "ik:osqp"}
     assert [m.spec for _, m in workspace.chosen(methods, ["hold", "ik"])] == ["hold", "ik"]
     with pytest.raises(UnknownNameError, match=r"'ikk' \(--workspace\).*did you mean ik"):
@@ -67,8 +69,8 @@ def test_the_best_two_or_those_named():
 
 def test_same_store_same_bytes(tmp_path):
     for folder in ("one", "two"):
-        paths = workspace.write_workspace(scattered(), tables.ABLATION, tmp_path / folder)
+        paths = workspace.write_workspace(ABLATION, methods_in(scattered()), tmp_path / folder)
         assert [path.name for path in paths] == ["ablation_v1_workspace.png", "ablation_v1_workspace.svg"]
     for path in paths:
         assert path.read_bytes() == (tmp_path / "one" / path.name).read_bytes()
-    assert workspace.write_workspace(FakeStore([]), tables.ABLATION, tmp_path) == []
+    assert workspace.write_workspace(ABLATION, {}, tmp_path) == []

@@ -17,9 +17,9 @@ from wbc_bench.errors import BenchError, UnknownNameError
 
 if TYPE_CHECKING:
     from wbc_bench.execution import Engine
+    from wbc_bench.results.store import ResultStore
+    from wbc_bench.results.tracking import Tracked
     from wbc_bench.robot import Robot, RobotConfig
-    from wbc_bench.store import ResultStore
-    from wbc_bench.tracking import Tracked
 
 # One thread a worker, whatever a library would like: set before numpy is loaded, inherited by workers.
 THREADS = {
@@ -71,8 +71,8 @@ class _Evaluation:
         from wbc_bench.files import ensure_writable
         from wbc_bench.manifest import manifest_path, read_manifest
         from wbc_bench.protocol import find_protocol
+        from wbc_bench.results.store import ResultStore
         from wbc_bench.robot import load_robot
-        from wbc_bench.store import ResultStore
 
         if not specs:
             raise UsageError("--controller: give at least one")
@@ -111,17 +111,21 @@ class Ablation(_Evaluation):
     """Controllers instead of the study's own list."""
 
     def run(self) -> None:
-        from wbc_bench import tables
         from wbc_bench.publish import publish
+        from wbc_bench.results.analysis import collect
+        from wbc_bench.results.study import ABLATION, Row
+        from wbc_bench.results.tables.pairs import pair_table
+        from wbc_bench.results.tables.paper import paper_table
 
-        study = tables.ABLATION
-        specs = self.controllers or tuple(tables.Row(*row).spec for row in study.rows)
+        study = ABLATION
+        specs = self.controllers or tuple(Row(*row).spec for row in study.rows)
         store = self._evaluate(
             study.protocol, specs, self.seeds, self.episodes, optional=not self.controllers
         )
         publish(store, self.out)
-        _print_table(tables.paper_table(store, study))
-        pairs = tables.pair_table(store, study)
+        evaluated = collect(store.runs(study.protocol))
+        _print_table(paper_table(study, evaluated))
+        pairs = pair_table(study, evaluated)
         if pairs.rows:
             _print_table(pairs)
         print(f"tables, figures and report.html are under {self.out}")
@@ -137,16 +141,17 @@ class Reach(_Evaluation):
     """Name or .toml file of a reach protocol."""
 
     def run(self) -> None:
-        from wbc_bench import tables
         from wbc_bench.protocol import ReachTargets, find_protocol
         from wbc_bench.publish import publish
+        from wbc_bench.results.analysis import collect
+        from wbc_bench.results.tables.reach import reach_table
 
         protocol, _ = find_protocol(self.protocol)
         if not isinstance(protocol.targets, ReachTargets):
             raise UsageError(f"--protocol {self.protocol}: its targets are not of type 'reach'")
         store = self._evaluate(self.protocol, self.controller, None, None)
         publish(store, self.out)
-        _print_table(tables.reach_table(store, protocol.name))
+        _print_table(reach_table(protocol.name, collect(store.runs(protocol.name))))
         print(f"tables, figures and report.html are under {self.out}")
 
 
@@ -164,13 +169,17 @@ class Eval(_Evaluation):
     """First episodes of each replicate; all of them when not given."""
 
     def run(self) -> None:
-        from wbc_bench import tables
         from wbc_bench.protocol import find_protocol
+        from wbc_bench.results.analysis import collect
+        from wbc_bench.results.study import Study
+        from wbc_bench.results.tables.paper import paper_table
+        from wbc_bench.results.tables.strata import outcome_table
 
         store = self._evaluate(self.protocol, self.controller, self.seeds, self.episodes)
-        study = tables.Study(find_protocol(self.protocol)[0].name, ())
-        _print_table(tables.paper_table(store, study))
-        _print_table(tables.outcome_table(store, study))
+        study = Study(find_protocol(self.protocol)[0].name, ())
+        evaluated = collect(store.runs(study.protocol))
+        _print_table(paper_table(study, evaluated))
+        _print_table(outcome_table(study, evaluated))
         print(f"records are under {self.out}; `wbc-bench report` makes tables and figures of them")
 
 
@@ -202,11 +211,11 @@ class Track:
         from wbc_bench.files import ensure_writable
         from wbc_bench.publish import publish_tracks
         from wbc_bench.registry import load_controller
+        from wbc_bench.results.tracking import read_tracks, tracking_table, write_track
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.library import check_source
         from wbc_bench.sources.live import LIVE
         from wbc_bench.track import CONDITIONS
-        from wbc_bench.tracking import read_tracks, tracking_table, write_track
 
         for option, given in (("--controller", self.controller), ("--source", self.source)):
             if not given:
@@ -331,7 +340,7 @@ class Replay(_Again):
 
     def run(self) -> None:
         from wbc_bench.progress import Progress
-        from wbc_bench.store import ResultStore
+        from wbc_bench.results.store import ResultStore
         from wbc_bench.viewer.replay import write_html
 
         self._check_folder(self.out)
@@ -365,7 +374,7 @@ class Film(_Again):
 
         from wbc_bench.files import write_atomic
         from wbc_bench.progress import Progress
-        from wbc_bench.store import ResultStore
+        from wbc_bench.results.store import ResultStore
         from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
         from wbc_bench.viewer.rerun import rerun
 
@@ -407,15 +416,17 @@ class Compare:
     """Also write the table into this folder."""
 
     def run(self) -> None:
-        from wbc_bench import tables
         from wbc_bench.files import ensure_writable
-        from wbc_bench.store import ResultStore
+        from wbc_bench.results.analysis import collect
+        from wbc_bench.results.store import ResultStore
+        from wbc_bench.results.tables.pairs import compare_table
+        from wbc_bench.results.tables.write import write_compare_table
 
-        store = ResultStore(self.results)
-        _print_table(tables.compare_table(store, self.protocol, self.a, self.b))
+        evaluated = collect(ResultStore(self.results).runs(self.protocol))
+        _print_table(compare_table(self.protocol, evaluated, self.a, self.b))
         if self.out:
             ensure_writable(self.out)
-            tables.write_compare(store, self.protocol, self.a, self.b, self.out)
+            write_compare_table(self.protocol, evaluated, self.a, self.b, self.out)
 
 
 @dataclass(frozen=True)
@@ -431,7 +442,7 @@ class Report:
 
     def run(self) -> None:
         from wbc_bench.publish import publish
-        from wbc_bench.store import ResultStore
+        from wbc_bench.results.store import ResultStore
 
         for path in publish(ResultStore(self.results), self.out or self.results, self.workspace):
             print(path)
@@ -455,10 +466,11 @@ class Latent:
     def run(self) -> None:
         from wbc_bench.files import ensure_writable
         from wbc_bench.introspection import sample_latents
-        from wbc_bench.latents import LEAST_EPISODES, summary, write_latents
         from wbc_bench.manifest import manifest_path, read_manifest
         from wbc_bench.protocol import find_protocol
         from wbc_bench.registry import load_controller, spec_of_replicate
+        from wbc_bench.results.figures.latents import summary, write_latents
+        from wbc_bench.results.latents import LEAST_EPISODES
         from wbc_bench.robot import load_robot
 
         protocol, path = find_protocol(self.protocol)
@@ -489,7 +501,7 @@ class List:
     def run(self) -> None:
         from importlib.metadata import entry_points
 
-        from wbc_bench.markup import Table
+        from wbc_bench.results.table import Table
 
         if self.inputs:
             for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
@@ -498,11 +510,11 @@ class List:
             return
 
         from wbc_bench.manifest import manifest_path
-        from wbc_bench.metrics import METRICS
         from wbc_bench.protocol import find_protocol, protocol_names
         from wbc_bench.registry import controllers
+        from wbc_bench.results.metrics import METRICS
+        from wbc_bench.results.store import ResultStore
         from wbc_bench.sources.library import find_script, script_names
-        from wbc_bench.store import ResultStore
 
         rows = [(name, point.value) for name, point in sorted(controllers().items())]
         _print_table(Table("controllers", "Controllers", ("Name", "Comes from"), tuple(rows)))
@@ -640,9 +652,9 @@ class Show:
 
         from wbc_bench.files import ensure_writable
         from wbc_bench.manifest import manifest_path, read_manifest
-        from wbc_bench.plots import write_targets
         from wbc_bench.protocol import find_protocol
         from wbc_bench.publish import target_frame
+        from wbc_bench.results.figures.targets import write_targets
 
         protocol, path = find_protocol(self.name)
         print(f"# digest {protocol.digest}")
@@ -722,7 +734,7 @@ class Bench:
         from importlib.metadata import entry_points
 
         from wbc_bench.files import ensure_writable
-        from wbc_bench.markup import Table
+        from wbc_bench.results.table import Table
 
         found = {point.name: point for point in entry_points(group=BENCHMARKS)}
         for name in self.names:
@@ -840,9 +852,9 @@ class DemoEval:
 
     def run(self) -> None:
         from wbc_bench.demo import evaluate
-        from wbc_bench.door_records import door_table, read_doors
         from wbc_bench.progress import Progress
         from wbc_bench.publish import publish_doors
+        from wbc_bench.results.doors import door_table, read_doors
         from wbc_bench.track import CONDITIONS
 
         _at_least_one("--episodes", self.episodes)

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from wbc_bench import provenance
 from wbc_bench.controller import Controller
-from wbc_bench.door_records import write_doors
 from wbc_bench.errors import SourceError
 from wbc_bench.files import ensure_writable
 from wbc_bench.registry import load_controller
+from wbc_bench.results.doors import write_doors
+from wbc_bench.results.tracking import STOOD
 from wbc_bench.robot import load_robot
 from wbc_bench.sources.diffusion.demonstrations import Demonstration, write_demonstrations
 from wbc_bench.sources.diffusion.expert import ExpertSource
@@ -23,7 +24,6 @@ from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.library import find_policy
 from wbc_bench.sources.slew import Pose
 from wbc_bench.track import Moment, door_protocol, episode_of, follow
-from wbc_bench.tracking import STOOD
 
 Array = NDArray[np.float64]
 DURATION = 12.0  # [s] of an episode: the expert takes 7 to 11

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from wbc_bench import metrics, provenance
+from wbc_bench import provenance
 from wbc_bench.controller import Controller
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest
@@ -29,9 +29,10 @@ from wbc_bench.outcomes import EpisodeBatch
 from wbc_bench.progress import Progress
 from wbc_bench.protocol import EvalProtocol
 from wbc_bench.registry import load_controller, spec_of_replicate
+from wbc_bench.results import metrics
+from wbc_bench.results.store import ResultStore, Run, RunKey, RunWriter, ShardCost
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
-from wbc_bench.store import ResultStore, Run, RunKey, RunWriter, ShardCost
 
 SHARD_EPISODES = 50
 ENGINES = ("loky", "dask")

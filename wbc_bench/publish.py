@@ -1,17 +1,27 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import pandas as pd
 
-from wbc_bench import door_records, plots, report, tables, tracking, workspace
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.protocol import PROTOCOL_DIR, ReachTargets, load_protocol, protocol_names
-from wbc_bench.store import ResultStore
+from wbc_bench.results import report
+from wbc_bench.results.analysis import Evaluated, collect_all
+from wbc_bench.results.doors import DoorRun, door_table, read_doors
+from wbc_bench.results.figures.reach import write_reach_figures
+from wbc_bench.results.figures.study import write_study_figures
+from wbc_bench.results.figures.targets import write_targets
+from wbc_bench.results.figures.tracking import write_tracking
+from wbc_bench.results.figures.workspace import write_workspace
+from wbc_bench.results.store import ResultStore
+from wbc_bench.results.study import ABLATION, Study
+from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
+from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 
 
 def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[Path]:
@@ -24,12 +34,11 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
         StoreError: the store has no run, mixes digests, or the folder cannot be written.
         UnknownNameError: a controller named has no run under any protocol.
     """
-    protocols = sorted({run.record.protocol for run in store.runs()})
-    tracks = tracking.read_tracks(store.root)
-    doors = door_records.read_doors(store.root)
-    if not protocols and not tracks and not doors:
+    evaluated = collect_all(store.runs())
+    tracks, doors = read_tracks(store.root), read_doors(store.root)
+    if not evaluated and not tracks and not doors:
         raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
-    known = {run.record.controller for run in store.runs()}
+    known = {spec for methods in evaluated.values() for spec in methods}
     for spec in beside:
         if spec not in known:
             raise UnknownNameError("evaluated controller", spec, known, "--workspace")
@@ -37,11 +46,11 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
             made = Path(folder)
-            for protocol in protocols:
-                _write_protocol(store, protocol, made, beside)
+            for protocol, methods in evaluated.items():
+                _write_protocol(protocol, methods, made, beside)
             _write_tracks(tracks, made)
             _write_doors(doors, made)
-            report.write(store, made, out)
+            report.write(evaluated, made, out)
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))
@@ -55,7 +64,7 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a track cannot be read or the folder cannot be written.
     """
     with _writing(out):
-        return _write_tracks(tracking.read_tracks(root), out)
+        return _write_tracks(read_tracks(root), out)
 
 
 def publish_doors(root: Path, out: Path) -> list[Path]:
@@ -64,7 +73,7 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a run cannot be read or the folder cannot be written.
     """
     with _writing(out):
-        return _write_doors(door_records.read_doors(root), out)
+        return _write_doors(read_doors(root), out)
 
 
 @contextmanager
@@ -81,31 +90,30 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
     return pd.DataFrame({"target_x": x, "target_y": y, "height": height, "stratum": manifest.stratum})
 
 
-def _write_protocol(store: ResultStore, name: str, out: Path, beside: Sequence[str]) -> None:
+def _write_protocol(name: str, methods: Mapping[str, Evaluated], out: Path, beside: Sequence[str]) -> None:
     released = load_protocol(PROTOCOL_DIR / f"{name}.toml") if name in protocol_names() else None
     if released and isinstance(released.targets, ReachTargets):
-        tables.write_reach(store, name, out / "tables")
-        plots.write_reach(store, name, out / "figures")
+        write_reach_tables(name, methods, out / "tables")
+        write_reach_figures(name, methods, out / "figures")
     else:
-        study = tables.ABLATION if name == tables.ABLATION.protocol else tables.Study(name, ())
-        tables.write_study(store, study, out / "tables")
-        plots.write_study(store, study, out / "figures")
-        known = {run.record.controller for run in store.runs(name)}
-        workspace.write_workspace(store, study, out / "figures", [spec for spec in beside if spec in known])
+        study = ABLATION if name == ABLATION.protocol else Study(name, ())
+        write_study_tables(study, methods, out / "tables")
+        write_study_figures(study, methods, out / "figures")
+        write_workspace(study, methods, out / "figures", [spec for spec in beside if spec in methods])
     if released:
         manifest, _ = read_manifest(released, manifest_path(PROTOCOL_DIR / f"{name}.toml"))
-        plots.write_targets(target_frame(manifest), name, out / "figures")
+        write_targets(target_frame(manifest), name, out / "figures")
 
 
-def _write_tracks(tracks: list[tracking.Track], out: Path) -> list[Path]:
+def _write_tracks(tracks: list[Track], out: Path) -> list[Path]:
     if not tracks:
         return []
-    paths = tracking.tracking_table(tracks).write(out / "tables")
-    return paths + plots.write_tracking(tracks, out / "figures")
+    paths = tracking_table(tracks).write(out / "tables")
+    return paths + write_tracking(tracks, out / "figures")
 
 
-def _write_doors(runs: list[door_records.DoorRun], out: Path) -> list[Path]:
-    return door_records.door_table(runs).write(out / "tables") if runs else []
+def _write_doors(runs: list[DoorRun], out: Path) -> list[Path]:
+    return door_table(runs).write(out / "tables") if runs else []
 
 
 def _move(source: Path, destination: Path) -> Path:

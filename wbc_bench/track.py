@@ -18,12 +18,12 @@ from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.observation import target_in_base
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.randomization import draw, undisturbed
+from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.simulation import Simulation, State
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
 from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import ScriptedSource
-from wbc_bench.tracking import STOOD, Series, Tracked
 
 Array = NDArray[np.float64]
 CONDITIONS = ("nominal", "randomised")

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wbc_bench.formatting import CM, DEG
 from wbc_bench.registry import controllers
+from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, rpy_from_matrix, wxyz_from_matrix
 from wbc_bench.sources import source_names
 from wbc_bench.viewer.moment import Array, Moment

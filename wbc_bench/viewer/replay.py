@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from wbc_bench.files import write_atomic
-from wbc_bench.formatting import CM, DEG
-from wbc_bench.store import Run
+from wbc_bench.results.formatting import CM, DEG
+from wbc_bench.results.store import Run
 from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress, rerun
 from wbc_bench.viewer.scene import Scene, serving
 

@@ -14,10 +14,10 @@ from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.provenance import machine
 from wbc_bench.registry import load_controller, spec_of_replicate
+from wbc_bench.results.store import Run
 from wbc_bench.robot import Robot, load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz
-from wbc_bench.store import Run
 from wbc_bench.viewer.moment import PUSH_SECONDS, Moment, moment_of
 
 Row = dict[str, Any]

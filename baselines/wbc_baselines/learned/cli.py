@@ -70,7 +70,7 @@ class Status:
 
     def run(self) -> None:
         from wbc_baselines.learned.campaign import standing
-        from wbc_bench.markup import Table
+        from wbc_bench.results.table import Table
 
         def share(value: float | None) -> str:
             return "" if value is None else f"{100 * value:.1f}"
@@ -143,7 +143,7 @@ class Bench:
     def run(self) -> None:
         from wbc_baselines.learned.campaign import runs_of
         from wbc_baselines.learned.speed import measure
-        from wbc_bench.markup import Table
+        from wbc_bench.results.table import Table
 
         if self.settings.backend != "cpu":
             raise TrainingError(f"--backend {self.settings.backend}: valid: cpu, whose engine is timed")

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.runs import RunFolder
-from wbc_bench.plots import DASHES, METHOD_COLOURS, STYLE, save
+from wbc_bench.results.figures.style import DASHES, METHOD_COLOURS, STYLE, save
 
 Rows = list[dict]
 SMOOTHING = 0.03  # of the samples: width of the moving mean

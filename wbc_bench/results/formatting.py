@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wbc_bench import stats
+from wbc_bench.results import stats
 
 CM = 100.0  # [cm/m]
 DEG = 180.0 / np.pi  # [deg/rad]

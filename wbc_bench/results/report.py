@@ -6,15 +6,16 @@ out. The same folder gives the same bytes.
 
 import base64
 import html
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from wbc_bench import gallery
-from wbc_bench.analysis import StoreLike, collect
 from wbc_bench.errors import StoreError
-from wbc_bench.markup import code_html, read_markdown
+from wbc_bench.results import gallery
+from wbc_bench.results.analysis import Evaluated
+from wbc_bench.results.table import code_html, read_markdown
 
 CSS = """
 :root { color-scheme: light; }
@@ -104,13 +105,13 @@ class _Sidecar(msgspec.Struct):
     caption: str
 
 
-def provenance_html(runs: list[Any]) -> str:
+def provenance_html(records: list[Any]) -> str:
     """One row a run, and under it the machines and versions that occur, each once."""
     header = ("Protocol", "Controller", "Replicate", "Completed", "Protocol digest", "Manifest sha256")
     header += ("Checkpoint", "Commit", "Created (UTC)", "Wall time (s)", "Workers", "Setup")
     setups: dict[tuple[str, str], str] = {}
     rows = []
-    for record in (run.record for run in runs):
+    for record in records:
         key = (_pairs(record.machine), _pairs(record.versions))
         setup = setups.setdefault(key, chr(ord("A") + len(setups)))
         dirty = ' <span class="tag">+ uncommitted changes</span>' if record.git_dirty else ""
@@ -144,8 +145,12 @@ def _pairs(values: dict[str, Any]) -> str:
     return html.escape(", ".join(f"{key} {values[key]}" for key in sorted(values)))
 
 
-def write(store: StoreLike, results_dir: Path | str, beside: Path | str | None = None) -> Path:
-    """Writes <results_dir>/report.html from its tables/*.md, its figures and the run records of the store.
+def write(
+    evaluated: Mapping[str, Mapping[str, Evaluated]],
+    results_dir: Path | str,
+    beside: Path | str | None = None,
+) -> Path:
+    """Writes <results_dir>/report.html from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
     will stand; `results_dir` when not given.
@@ -157,11 +162,11 @@ def write(store: StoreLike, results_dir: Path | str, beside: Path | str | None =
     tables = sorted((root / "tables").glob("*.md"))
     figures = [stem for stem in _stems(root / "figures") if not _is_given(stem)]
     given = [stem for stem in _stems(beside / "figures") if _is_given(stem)]
-    runs = sorted(
-        store.runs(), key=lambda run: (run.record.protocol, run.record.controller, run.record.replicate)
-    )
-    # A section a protocol: its files begin with its name, and the longest such name owns a file.
-    protocols = sorted({run.record.protocol for run in runs})
+    records = [
+        record for methods in evaluated.values() for method in methods.values() for record in method.records
+    ]
+    # A section per protocol: its files begin with its name, and the longest such name owns a file.
+    protocols = list(evaluated)
 
     parts_of_report = [*protocols, "tracking", "doors"]
 
@@ -178,21 +183,23 @@ def write(store: StoreLike, results_dir: Path | str, beside: Path | str | None =
         parts = [*shown[:1], *images, *shown[1:]]  # what most readers came for, first
         if protocol in protocols:
             parts.append(f'<p class="rule">{code_html(gallery.RULE)}</p>\n')
-            evaluated = collect(store, protocol).values()
-            parts += [gallery.gallery_html(protocol, method, beside) for method in evaluated]
+            methods = evaluated[protocol].values()
+            parts += [gallery.gallery_html(protocol, method, beside) for method in methods]
         if parts:
             sections.append((protocol or "More", "".join(parts)))
     for prefix, title in GIVEN_SECTIONS:
         own = [_figure(beside, stem) for stem in given if stem.startswith(prefix)]
         if own:
             sections.append((title, "".join(figure_html(path, given_caption(path)) for path in own)))
-    sections.append(("Where the numbers come from", provenance_html(runs) if runs else "<p>No run yet.</p>"))
+    sections.append(
+        ("Where the numbers come from", provenance_html(records) if records else "<p>No run yet.</p>")
+    )
     links = "".join(f'<a href="#s{k}">{html.escape(name)}</a>' for k, (name, _) in enumerate(sections))
     body = "".join(
         f'<h2 id="s{k}">{html.escape(name)}</h2>\n{part}' for k, (name, part) in enumerate(sections)
     )
-    controllers = len({run.record.controller for run in runs})
-    episodes = sum(run.record.completed for run in runs)
+    controllers = len({record.controller for record in records})
+    episodes = sum(record.completed for record in records)
     lead = f"{episodes} episodes, {controllers} controllers, {len(protocols)} protocols"
     path = root / "report.html"
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,10 +4,10 @@ Pure functions of the episode records; no file is written here.
 """
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -31,10 +31,6 @@ class RunLike(Protocol):
     @property
     def record(self) -> Any: ...
     def episodes(self) -> pd.DataFrame: ...
-
-
-class StoreLike(Protocol):
-    def runs(self, protocol: str | None = None) -> Sequence[Any]: ...
 
 
 @dataclass(frozen=True)
@@ -71,12 +67,12 @@ class Evaluated:
         return stood(self.episodes)
 
 
-def collect(store: StoreLike, protocol: str) -> dict[str, Evaluated]:
-    """Spec -> its runs under a protocol, sorted by spec.
+def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
+    """Spec -> its runs, sorted by spec, of runs under one protocol; reads their episodes, so call it once.
 
     Raises: StoreError when two runs answered different protocols or manifests under the same name.
     """
-    runs = sorted(store.runs(protocol), key=lambda run: (run.record.controller, run.record.replicate))
+    runs = sorted(runs, key=lambda run: (run.record.controller, run.record.replicate))
     first: dict[str, tuple[str, str]] = {}  # what must agree -> (value, the first run that said so)
     for record in (run.record for run in runs):
         for key, value in (
@@ -86,8 +82,9 @@ def collect(store: StoreLike, protocol: str) -> dict[str, Evaluated]:
             known, owner = first.setdefault(key, (value, record.controller))
             if known != value:
                 raise StoreError(
-                    f"runs of '{protocol}' answer different questions: {key} is {known} for '{owner}' and "
-                    f"{value} for '{record.controller}'; evaluate both again under one protocol"
+                    f"runs of '{record.protocol}' were evaluated with different manifests: {key} is {known} "
+                    f"for '{owner}' and {value} for '{record.controller}'; evaluate both again under one "
+                    "protocol"
                 )
     grouped: dict[str, list[Any]] = {}
     for run in runs:
@@ -100,6 +97,17 @@ def collect(store: StoreLike, protocol: str) -> dict[str, Evaluated]:
         )
         for spec, group in grouped.items()
     }
+
+
+def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
+    """Protocol -> spec -> its runs, both sorted; every file of episodes is read once.
+
+    Raises: StoreError, see `collect`.
+    """
+    grouped: dict[str, list[RunLike]] = {}
+    for run in sorted(runs, key=lambda run: run.record.protocol):
+        grouped.setdefault(run.record.protocol, []).append(run)
+    return {protocol: collect(group) for protocol, group in grouped.items()}
 
 
 def column(episodes: pd.DataFrame, name: str) -> FloatArray:
@@ -131,7 +139,7 @@ def strata_of(episodes: pd.DataFrame) -> list[str]:
 
 @cache
 def paper_values() -> dict[str, Any]:
-    text = resources.files("wbc_bench").joinpath("paper_values.toml").read_text(encoding="utf-8")
+    text = Path(__file__).with_name("paper_values.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from wbc_bench import stats
-from wbc_bench.formatting import DEG, number_text
-from wbc_bench.markup import Table
-from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
-from wbc_bench.tracking import STOOD
+from wbc_bench.results import stats
+from wbc_bench.results.formatting import DEG, number_text
+from wbc_bench.results.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.results.table import Table
+from wbc_bench.results.tracking import STOOD
 
 
 class DoorRecord(msgspec.Struct, frozen=True, kw_only=True):

@@ -1,6 +1,6 @@
 """Where in the workspace episodes succeed: rates over bins of target positions, from the side and above."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,10 +11,10 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
-from wbc_bench.analysis import Evaluated, FloatArray, StoreLike, collect, column
 from wbc_bench.errors import UnknownNameError
-from wbc_bench.plots import save, styled
-from wbc_bench.tables import Study, methods_of
+from wbc_bench.results.analysis import Evaluated, FloatArray, column
+from wbc_bench.results.figures.style import save, styled
+from wbc_bench.results.study import Study, methods_of
 
 BINS = (0.1, 0.15, 0.2, 0.3, 0.4)  # [m] edges of a bin to choose from
 ENOUGH = 0.8  # of the episodes lie in bins of FEW or more: then a bin is not too small
@@ -106,14 +106,14 @@ def chosen(methods: Sequence[tuple[str, Evaluated]], specs: Sequence[str]) -> li
 
 
 def write_workspace(
-    store: StoreLike, study: Study, out_dir: Path | str, specs: Sequence[str] = ()
+    study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str, specs: Sequence[str] = ()
 ) -> list[Path]:
     """Targets, and beside them success of some controllers (default: the best two), as <protocol>_workspace.
 
     Raises: UnknownNameError, a controller named has no run.
     """
-    evaluated = methods_of(study, collect(store, study.protocol))
-    methods = chosen(evaluated, specs) if specs else best(evaluated)
+    known = methods_of(study, evaluated)
+    methods = chosen(known, specs) if specs else best(known)
     if not methods:
         return []
     size = bin_size(methods[0][1])

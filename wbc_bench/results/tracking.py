@@ -13,10 +13,10 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from wbc_bench.formatting import CM, DEG, NONE, number_text
-from wbc_bench.markup import Table
-from wbc_bench.metrics import spectral_arc_length
-from wbc_bench.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.results.formatting import CM, DEG, NONE, number_text
+from wbc_bench.results.metrics import spectral_arc_length
+from wbc_bench.results.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.results.table import Table
 from wbc_bench.rotations import geodesic_angle
 
 Array = NDArray[np.float64]

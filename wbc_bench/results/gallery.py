@@ -6,10 +6,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from wbc_bench.analysis import ANGLE_TOLERANCE, REACH_TOLERANCE, Evaluated, FloatArray, column, subset
 from wbc_bench.files import folder_name
-from wbc_bench.formatting import CM, DEG, number_text
 from wbc_bench.outcomes import TERMINATED, Outcome
+from wbc_bench.results.analysis import (
+    ANGLE_TOLERANCE,
+    REACH_TOLERANCE,
+    Evaluated,
+    FloatArray,
+    column,
+    subset,
+)
+from wbc_bench.results.formatting import CM, DEG, number_text
 
 SHOWN = 10  # episodes an outcome
 RULE = (

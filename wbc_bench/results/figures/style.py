@@ -1,0 +1,51 @@
+"""Colours and line styles of all figures, and how a figure is saved: equal figures give equal bytes."""
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib import style
+from matplotlib.figure import Figure
+
+from wbc_bench.outcomes import Outcome
+
+STYLE = Path(__file__).with_name("wbc.mplstyle")
+# Okabe-Ito, named.
+BLUE, VERMILION, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
+GREY = "#767676"
+SHADE = "#EDEDED"
+OUTCOME_COLOURS = {
+    Outcome.SUCCESS: GREEN,
+    Outcome.DRIFTED: SKY,
+    Outcome.MISSED: ORANGE,
+    Outcome.QP_INFEASIBLE: PINK,
+    Outcome.FELL: VERMILION,
+    Outcome.ILLEGAL_CONTACT: BLUE,
+    Outcome.INVALID: BLACK,
+}
+STRATUM_COLOURS = {"arm": BLUE, "posture": ORANGE, "step": GREEN, "beyond": GREY}
+CONDITION_COLOURS = {"nominal": BLUE, "randomised": VERMILION}
+METHOD_COLOURS: tuple[str, ...] = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, BLACK)
+# noise and pushes make many lines of one: they stay behind the undisturbed
+CONDITION_LINES: dict[str, dict[str, Any]] = {
+    "nominal": {"lw": 1.4, "zorder": 3},
+    "randomised": {"lw": 0.6, "alpha": 0.45, "zorder": 2},
+}
+DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # so that curves that coincide both show
+
+
+def save(figure: Figure, name: str, out_dir: Path | str) -> list[Path]:
+    """Writes <out_dir>/<name>.png and .svg without dates or program versions in them."""
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    png, svg = folder / f"{name}.png", folder / f"{name}.svg"
+    figure.savefig(png, metadata={"Software": None})
+    figure.set_layout_engine("none")  # laid out by now; both files look the same
+    figure.savefig(svg, metadata={"Date": None, "Creator": None})
+    return [png, svg]
+
+
+def styled():
+    """The bench's style as a context."""
+    # "default" first: a reader's own matplotlibrc must not change the figure.
+    return style.context(["default", str(STYLE)])

@@ -1,0 +1,139 @@
+"""The heights that a controller reaches straight ahead."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from wbc_bench.files import folder_name
+from wbc_bench.results import stats
+from wbc_bench.results.analysis import (
+    END_ZONE,
+    REACH_TOLERANCE,
+    Evaluated,
+    HeightRange,
+    by_height,
+    median,
+    oscillation,
+    paper_values,
+    reach_range,
+    reached,
+    stood,
+    strata_of,
+    subset,
+    variants,
+)
+from wbc_bench.results.analysis import column as series
+from wbc_bench.results.formatting import (
+    CM,
+    NONE,
+    number_text,
+)
+from wbc_bench.results.table import Table
+
+
+def _range(span: HeightRange) -> str:
+    return "none" if np.isnan(span.low) else f"{span.low * CM:.0f}–{span.high * CM:.0f}"
+
+
+def reach_table(protocol: str, evaluated: Mapping[str, Evaluated]) -> Table:
+    """Lowest and highest height of each controller and variant, and how much it sways near them."""
+    rows, data = [], []
+    block = paper_values()["reach"]
+    for name, (low, high) in ((k, v) for k, v in block.items() if k != "source"):
+        rows.append((f"{name}, paper ({block['source']})", *[NONE] * 3, f"{low}–{high}", *[NONE] * 4))
+        data.append({"controller": name, "source": "paper", "low_cm": low, "high_cm": high})
+    for spec, method in evaluated.items():
+        for k, (condition, orientation, episodes) in enumerate(variants(method.episodes)):
+            span, strict = reach_range(episodes), reach_range(episodes, strict=True)
+            speed = oscillation(episodes, span, "ee_speed_rms")
+            sparc = oscillation(episodes, span, "ee_sparc")
+            total = f"{len(episodes)}" if k else f"{len(episodes)} (run: {method.counts})"
+            rows.append(
+                (
+                    *(spec if k == 0 else "", condition, orientation, total),
+                    *(_range(span), f"{span.reached}/{len(by_height(episodes))}", _range(strict)),
+                    " / ".join(number_text(value * CM, 1) for value in speed),
+                    " / ".join(number_text(value, 2) for value in sparc),
+                )
+            )
+            zones = ("low_end", "middle", "high_end")
+            data.append(
+                {
+                    **{"controller": spec, "source": "measured", "condition": condition},
+                    **{"orientation": orientation, "episodes": len(episodes)},
+                    **{"low_cm": span.low * CM, "high_cm": span.high * CM, "heights_reached": span.reached},
+                    **{"strict_low_cm": strict.low * CM, "strict_high_cm": strict.high * CM},
+                    **{f"speed_rms_{zone}_cm_s": v * CM for zone, v in zip(zones, speed, strict=True)},
+                    **{f"sparc_{zone}": v for zone, v in zip(zones, sparc, strict=True)},
+                }
+            )
+    header = (
+        *("Controller", "Dynamics", "Gripper", "Episodes", "Reached (cm)", "Heights reached"),
+        *("Succeeded (cm)", "EE speed RMS (cm/s) low / mid / high", "SPARC low / mid / high"),
+    )
+    notes = (
+        "Reached: the longest run of neighbouring heights at which the median position error over the final "
+        f"1 s is below {REACH_TOLERANCE * CM:.0f} cm, a terminated episode counting as infinitely far. "
+        "Succeeded: the same with more than half of the episodes inside 5 cm and 7 deg at every step "
+        "of that second.",
+        "Oscillation in the final 1 s, median over episodes that did not terminate: within "
+        f"{END_ZONE * CM:.0f} cm of the low end of the range reached, between, within as much of the high "
+        "end. SPARC is the spectral arc length of the end-effector's speed (0 is smoothest).",
+        "The paper's ranges are of a real robot; it states no rule for what counts as reached.",
+    )
+    frame = pd.DataFrame(data)
+    frame["episodes"] = frame["episodes"].astype("Int64") if "episodes" in frame else pd.NA
+    return Table(f"{protocol}", f"{protocol}: heights reached", header, tuple(rows), notes, frame)
+
+
+def height_table(protocol: str, method: Evaluated) -> Table:
+    """Success with its interval and median error at every height, a pair of columns a variant."""
+    parts = [(c, o, dict(by_height(episodes))) for c, o, episodes in variants(method.episodes)]
+    heights = sorted({height for _, _, groups in parts for height in groups})
+    rows, data = [], []
+    for height in heights:
+        cells = []
+        for condition, orientation, groups in parts:
+            if height not in groups:
+                cells += [NONE, NONE]
+                continue
+            episodes = groups[height]
+            kept = subset(episodes, stood(episodes))
+            rate = stats.wilson(int(series(episodes, "success").sum()), len(episodes), len(method.records))
+            error = median(series(kept, "position_error"))
+            terminated = len(episodes) - len(kept)
+            cells += [
+                f"{rate.point * 100:.0f} [{rate.low * 100:.0f}, {rate.high * 100:.0f}]",
+                number_text(error * CM, 1) + (f" ({terminated})" if terminated else ""),
+            ]
+            data.append(
+                {
+                    **{"controller": method.spec, "condition": condition, "orientation": orientation},
+                    **{
+                        "height_cm": height * CM,
+                        "stratum": "+".join(strata_of(episodes)),
+                        "episodes": len(episodes),
+                    },
+                    **{
+                        "terminated": terminated,
+                        "success_rate": rate.point,
+                        "low": rate.low,
+                        "high": rate.high,
+                    },
+                    "reached": reached(episodes),
+                    "median_position_error_cm": error * CM,
+                    "median_ee_speed_rms_cm_s": median(series(kept, "ee_speed_rms")) * CM,
+                    "median_ee_sparc": median(series(kept, "ee_sparc")),
+                }
+            )
+        rows.append((f"{height * CM:.0f}", *cells))
+    labels = [f"{c}, {o}: {what}" for c, o, _ in parts for what in ("success (%) [95 %]", "median pos. (cm)")]
+    sizes = sorted({len(episodes) for _, _, groups in parts for episodes in groups.values()})
+    notes = (
+        f"{' or '.join(map(str, sizes))} episodes a height and variant. Success with its Wilson interval; "
+        "median position error over the final 1 s of episodes that did not terminate (in brackets: how many "
+        "did).",
+    )
+    name, title = f"{protocol}_heights_{folder_name(method.spec)}", f"{protocol}: {method.spec} by height"
+    return Table(name, title, ("Height (cm)", *labels), tuple(rows), notes, pd.DataFrame(data))
