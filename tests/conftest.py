@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from tiny_protocol import manifest
 
-from wbc_bench.manifest import EpisodeManifest
-from wbc_bench.protocol import EvalProtocol, find_protocol
-from wbc_bench.randomization import undisturbed
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
+from wbc_bench.episodes.randomization import undisturbed
 
 CalmRows = Callable[..., EpisodeManifest]
 

@@ -8,7 +8,7 @@ from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.estimators import Batch, Estimator, make_estimator
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.networks import Actor
-from wbc_bench.protocol import find_protocol
+from wbc_bench.episodes.protocol import find_protocol
 
 
 def networks(method: str, seed: int = 0) -> tuple[Actor, Estimator]:

@@ -13,7 +13,7 @@ from test_execution import write_controller
 from tiny_protocol import write_tiny
 
 from wbc_bench.cli import main
-from wbc_bench.manifest import manifest_path
+from wbc_bench.episodes.manifest import manifest_path
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from test_cli import fails
 
 from wbc_bench import demo
 from wbc_bench.cli import main
+from wbc_bench.episodes.single import door_protocol, episode_of
 from wbc_bench.errors import SourceError, StoreError
 from wbc_bench.registry import load_controller
 from wbc_bench.results.doors import door_table, read_doors
@@ -41,7 +42,7 @@ from wbc_bench.sources.diffusion.scene import CLOSED, GRIP, STANDOFF, Door, Door
 from wbc_bench.sources.diffusion.source import DiffusionSource
 from wbc_bench.sources.library import POLICY
 from wbc_bench.sources.slew import Pose
-from wbc_bench.track import door_protocol, episode_of, track
+from wbc_bench.track import track
 
 DOOR = Door(x=0.68, y=0.1, z=1.1, yaw=0.1, angle=0.6)
 

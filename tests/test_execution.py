@@ -13,11 +13,11 @@ import pytest
 from tiny_protocol import write_tiny
 
 from wbc_bench import execution
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import load_protocol
 from wbc_bench.errors import ControllerError, StoreError, UnknownNameError
 from wbc_bench.execution import Engine, ExecutionError, Job, evaluate_shard, run_jobs
-from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.outcomes import Outcome
-from wbc_bench.protocol import load_protocol
 from wbc_bench.results.store import ResultStore
 
 EPISODES = 120  # three shards, the last one short

@@ -18,10 +18,10 @@ from wbc_baselines.ik.reference import MAX_LEAN, Reference, plan
 from wbc_baselines.ik.settings import TUNED
 from wbc_baselines.ik.stance import base_from_stance, measured_stance
 from wbc_bench.controller import Observation, Proprioception, Target
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import UnknownNameError
-from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.outcomes import Outcome
-from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz

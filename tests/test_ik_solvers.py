@@ -12,8 +12,8 @@ from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import Weights
 from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
-from wbc_bench.manifest import manifest_path, read_manifest
-from wbc_bench.protocol import find_protocol
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.robot import load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 

@@ -12,9 +12,9 @@ from wbc_baselines.ik.model import GRAVITY, WholeBodyModel, configuration
 from wbc_baselines.ik.settings import TUNED
 from wbc_baselines.ik.stance import Stance, base_from_sole, measured_stance, yaw_matrix
 from wbc_baselines.ik.stepping import Swing, choose, landing, outside, pressure, solve_leg
-from wbc_bench.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.outcomes import TERMINATED
-from wbc_bench.protocol import find_protocol
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
 

@@ -14,8 +14,8 @@ from safetensors.torch import load_file, save_file
 from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.checkpoint import CheckpointError
 from wbc_baselines.learned.methods import METHODS
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.errors import BenchError, UnknownNameError
-from wbc_bench.protocol import find_protocol
 from wbc_bench.registry import load_controller, spec_of_replicate
 from wbc_bench.robot import RobotConfig, load_robot
 

@@ -18,13 +18,13 @@ from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Policy
 from wbc_bench.cli import main
 from wbc_bench.controller import DEPLOYABLE, Observation, Target
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import BenchError
 from wbc_bench.introspection import sample_latents
-from wbc_bench.manifest import manifest_path, read_manifest
 from wbc_bench.observation import Sensors
-from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.registry import load_controller
-from wbc_bench.results import latents
+from wbc_bench.results.figures import latents
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import geodesic_angle

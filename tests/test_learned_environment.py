@@ -27,12 +27,12 @@ from wbc_baselines.learned.starts import (  # noqa: E402
     weakened,
 )
 from wbc_baselines.learned.training import training_protocol  # noqa: E402
-from wbc_bench import randomization  # noqa: E402
+from wbc_bench.episodes import randomization  # noqa: E402
+from wbc_bench.episodes.manifest import EpisodeManifest  # noqa: E402
+from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
 from wbc_bench.errors import ManifestError  # noqa: E402
-from wbc_bench.manifest import EpisodeManifest  # noqa: E402
 from wbc_bench.observation import Sensors  # noqa: E402
 from wbc_bench.outcomes import STRATA  # noqa: E402
-from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 from wbc_bench.rotations import matrix_from_wxyz  # noqa: E402
@@ -400,7 +400,7 @@ def test_the_pool_is_feasible_and_its_own():
     drawn = draw_pool(PROTOCOL, 2)
     for mine, theirs in zip(drawn, POOL, strict=True):
         np.testing.assert_array_equal(mine, theirs[:2])
-    from wbc_bench.manifest import manifest_path, read_manifest
+    from wbc_bench.episodes.manifest import manifest_path, read_manifest
 
     frozen, _ = read_manifest(
         *(lambda found: (found[0], manifest_path(found[1])))(find_protocol("ablation_v1"))

@@ -12,8 +12,8 @@ from wbc_baselines.learned.export import OnnxEngine
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Policy
 from wbc_bench.cli import main
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import RobotConfig, load_robot
 from wbc_bench.rollout import evaluate

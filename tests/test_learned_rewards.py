@@ -13,7 +13,7 @@ from wbc_baselines.learned.methods import Reward  # noqa: E402
 from wbc_baselines.learned.pool import read_pool  # noqa: E402
 from wbc_baselines.learned.reference import gate  # noqa: E402
 from wbc_baselines.learned.starts import DECAY  # noqa: E402
-from wbc_bench.protocol import find_protocol  # noqa: E402
+from wbc_bench.episodes.protocol import find_protocol  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz  # noqa: E402
 

@@ -35,8 +35,8 @@ from wbc_baselines.learned.speed import measure  # noqa: E402
 from wbc_baselines.learned.starts import draw_starts  # noqa: E402
 from wbc_baselines.learned.training import Trainer, advantages, make_environment  # noqa: E402
 from wbc_bench import simulation  # noqa: E402
+from wbc_bench.episodes.protocol import Noise, Push, find_protocol  # noqa: E402
 from wbc_bench.errors import UnknownNameError  # noqa: E402
-from wbc_bench.protocol import Noise, Push, find_protocol  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.registry import load_controller  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402

@@ -11,7 +11,7 @@ from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
 from wbc_baselines.learned.backends.warp import WarpBackend  # noqa: E402
 from wbc_baselines.learned.pool import read_pool  # noqa: E402
 from wbc_baselines.learned.starts import draw_starts  # noqa: E402
-from wbc_bench.protocol import find_protocol  # noqa: E402
+from wbc_bench.episodes.protocol import find_protocol  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 

@@ -6,11 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from wbc_bench.episodes.freeze import build_manifest, freeze
+from wbc_bench.episodes.kinds import kind_of
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest, write_manifest
+from wbc_bench.episodes.protocol import find_protocol, load_protocol, protocol_names
+from wbc_bench.episodes.targets import BEYOND
+from wbc_bench.episodes.verify import verify
 from wbc_bench.errors import ManifestError, ProtocolError
-from wbc_bench.freeze import build_manifest, expected_rows, freeze, verify
-from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest, write_manifest
-from wbc_bench.protocol import PROTOCOL_DIR, find_protocol, load_protocol, protocol_names
-from wbc_bench.targets import BEYOND
+from wbc_bench.files import PROTOCOLS
 
 SMOKE, SMOKE_FILE = find_protocol("smoke_v1")
 
@@ -64,7 +67,7 @@ def same(a: EpisodeManifest, b: EpisodeManifest) -> bool:
 def test_what_is_written_is_what_is_read(smoke: EpisodeManifest, frozen: Path) -> None:
     manifest, sha256 = read_manifest(SMOKE, frozen)
     assert sha256 == hashlib.sha256(frozen.read_bytes()).hexdigest()
-    assert same(manifest, smoke) and len(manifest) == expected_rows(SMOKE) == 12
+    assert same(manifest, smoke) and len(manifest) == kind_of(SMOKE).num_rows(SMOKE) == 12
     frozen.with_suffix(".sha256").unlink()
     with pytest.raises(ManifestError, match="none recorded"):
         read_manifest(SMOKE, frozen)
@@ -131,7 +134,7 @@ def test_verify_finds_a_false_value(
 def test_a_stratum_that_the_box_does_not_hold_is_an_error(tmp_path: Path, monkeypatch) -> None:
     file = tmp_path / "far.toml"
     file.write_text(SMOKE_FILE.read_text().replace("x = [-0.8, 0.8]", "x = [7.0, 8.0]"))
-    monkeypatch.setattr("wbc_bench.targets.MAX_ATTEMPTS", 50)
+    monkeypatch.setattr("wbc_bench.episodes.workspace_targets.MAX_ATTEMPTS", 50)
     with pytest.raises(ProtocolError, match=r"none of 50 poses .* 'arm' .* at `\$\.targets`"):
         build_manifest(load_protocol(file))
 
@@ -164,8 +167,8 @@ def test_every_released_protocol_has_its_manifest() -> None:
     for name in protocol_names():
         protocol, path = find_protocol(name)
         manifest, _ = read_manifest(protocol, manifest_path(path))
-        assert len(manifest) == expected_rows(protocol)
-    assert not list(PROTOCOL_DIR.glob(".*"))
+        assert len(manifest) == kind_of(protocol).num_rows(protocol)
+    assert not list(PROTOCOLS.glob(".*"))
 
 
 @pytest.mark.parametrize("name", ["smoke_v1", "ablation_v1", "tuning_v1"])

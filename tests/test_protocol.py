@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from wbc_bench.episodes.protocol import find_protocol, load_protocol, protocol_names
 from wbc_bench.errors import ProtocolError, UnknownNameError
-from wbc_bench.protocol import PROTOCOL_DIR, find_protocol, load_protocol, protocol_names
+from wbc_bench.files import PROTOCOLS
 
-SMOKE = (PROTOCOL_DIR / "smoke_v1.toml").read_text()
-REACH = (PROTOCOL_DIR / "reach_v1.toml").read_text()
+SMOKE = (PROTOCOLS / "smoke_v1.toml").read_text()
+REACH = (PROTOCOLS / "reach_v1.toml").read_text()
 
 
 def written(folder: Path, text: str) -> Path:
@@ -89,7 +90,7 @@ def test_unknown_protocol_is_told_the_nearest(tmp_path: Path) -> None:
 
 
 def test_digest_covers_meaning_not_layout(tmp_path: Path) -> None:
-    plain = load_protocol(PROTOCOL_DIR / "smoke_v1.toml")
+    plain = load_protocol(PROTOCOLS / "smoke_v1.toml")
     assert (
         load_protocol(written(tmp_path, "# why\n" + SMOKE.replace("0.5, 0.9", "0.50,  0.9"))).digest
         == plain.digest

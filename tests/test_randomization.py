@@ -5,8 +5,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from wbc_bench.protocol import MAX_PUSHES, Push, find_protocol
-from wbc_bench.randomization import EpisodeDraws, draw, draw_pushes, resting_height, undisturbed
+from wbc_bench.episodes.protocol import MAX_PUSHES, Push, find_protocol
+from wbc_bench.episodes.randomization import EpisodeDraws, draw, draw_pushes, resting_height, undisturbed
 from wbc_bench.randomness import stream
 from wbc_bench.robot import load_robot
 

@@ -3,8 +3,8 @@
 import re
 from pathlib import Path
 
-from wbc_bench.manifest import manifest_path, read_manifest
-from wbc_bench.protocol import find_protocol
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate

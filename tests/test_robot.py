@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from wbc_bench.errors import BenchError, ProtocolError, UnknownNameError
-from wbc_bench.robot import JOINT_NAMES, Robot, RobotConfig, build_spec, load_facts, load_robot, picture
+from wbc_bench.robot import JOINT_NAMES, Robot, RobotConfig, build_spec, load_facts, load_robot
 from wbc_bench.rotations import wxyz_from_matrix, xyzw_from_wxyz
+from wbc_bench.viewer import picture
 
 FACTS = load_facts()
 NUM_SAMPLES = 20

@@ -9,10 +9,10 @@ import pytest
 from conftest import CalmRows
 
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Signal, Target
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, Termination, find_protocol
 from wbc_bench.errors import ControllerError
-from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.outcomes import EpisodeBatch, Outcome
-from wbc_bench.protocol import EvalProtocol, Termination, find_protocol
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import Robot, load_robot
 from wbc_bench.rollout import RUNNING, _classify, evaluate

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from conftest import CalmRows
 
-from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.protocol import EvalProtocol, find_protocol
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import Robot, load_robot
 from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.simulation import Simulation, State

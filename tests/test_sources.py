@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from wbc_bench.episodes.static_solver import StaticSolver, static_solver
+from wbc_bench.episodes.targets import classify
 from wbc_bench.errors import SourceError, UnknownNameError
-from wbc_bench.posture import StaticSolver, static_solver
 from wbc_bench.robot import RobotConfig
 from wbc_bench.rotations import geodesic_angle, matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 from wbc_bench.sources import FRAMES, Seen, StampedTarget, from_world, load_source, to_world
-from wbc_bench.sources.library import SOURCE_DIR, script_names
+from wbc_bench.sources.library import SCRIPTS, script_names
 from wbc_bench.sources.live import LiveSource
 from wbc_bench.sources.paths import laps, line, minimum_jerk
 from wbc_bench.sources.scripted import ScriptedSource, load_script
 from wbc_bench.sources.slew import Limits, Pose, slew
-from wbc_bench.targets import classify
 
 PERIOD = 0.02  # [s]
 
@@ -129,7 +129,7 @@ def test_library_is_feasible(name: str, solver: StaticSolver) -> None:
 
 def test_a_script_in_the_base_frame_moves_with_the_base(tmp_path: Path) -> None:
     file = tmp_path / "base.toml"
-    text = (SOURCE_DIR / "figure_eight.toml").read_text()
+    text = (SCRIPTS / "figure_eight.toml").read_text()
     file.write_text('frame = "base"\n' + text.replace("1.20", "0.36"))
     source = ScriptedSource(load_script(file))
     seen, moved = seen_at(), seen_at(0.5, (0.2, 0.1, 0.7))

@@ -4,28 +4,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from wbc_bench.posture import (
-    CLEARANCE,
-    EFFORT_SHARE,
-    JOINT_MARGIN,
-    Stance,
-    StaticSolver,
-    in_stance,
-    out_of_stance,
-    two_link,
-)
-from wbc_bench.protocol import WorkspaceTargets, find_protocol
+from wbc_bench.episodes.ground_frame import GroundFrame, from_ground_frame, to_ground_frame
+from wbc_bench.episodes.protocol import WorkspaceTargets, find_protocol
+from wbc_bench.episodes.reach_targets import ReachPose, best_reach_pose, reach_poses
+from wbc_bench.episodes.static_solver import CLEARANCE, EFFORT_SHARE, JOINT_MARGIN, StaticSolver, two_link
+from wbc_bench.episodes.targets import classify, solver_of
+from wbc_bench.episodes.workspace_targets import draw_workspace_target, stratum_of
 from wbc_bench.robot import NUM_LEG_JOINTS, RobotConfig, load_robot
 from wbc_bench.rotations import geodesic_angle, matrix_from_rpy, matrix_from_wxyz
-from wbc_bench.targets import (
-    ReachPose,
-    best_reach_pose,
-    classify,
-    draw_workspace_target,
-    reach_poses,
-    solver_of,
-    stratum_of,
-)
 
 SMOKE = find_protocol("smoke_v1")[0]
 
@@ -221,17 +207,17 @@ def test_clearance_above_the_ground(solver: StaticSolver) -> None:
 
 def test_stance_moves_poses_and_back(solver: StaticSolver) -> None:
     rng = np.random.default_rng(3)
-    stance = Stance(0.3, -0.2, 0.4)
+    stance = GroundFrame(0.3, -0.2, 0.4)
     pos, rot = rng.normal(size=(7, 3)), matrix_from_rpy(rng.normal(size=(7, 3)))
-    again_pos, again_rot = in_stance(stance, *out_of_stance(stance, pos, rot))
+    again_pos, again_rot = to_ground_frame(stance, *from_ground_frame(stance, pos, rot))
     np.testing.assert_allclose(again_pos, pos, atol=1e-12)
     np.testing.assert_allclose(again_rot, rot, atol=1e-12)
-    base, turn = out_of_stance(stance, np.array([0, 0, solver.default_height]), np.eye(3))
+    base, turn = from_ground_frame(stance, np.array([0, 0, solver.default_height]), np.eye(3))
     half = stance.yaw / 2
     quat = np.array([np.cos(half), 0, 0, np.sin(half)])
     np.testing.assert_allclose(turn, matrix_from_wxyz(quat), atol=1e-12)
     qpos = np.r_[base, quat, solver.robot.default_q]
-    assert solver.stance_of(qpos) == pytest.approx(stance)
+    assert solver.ground_frame_of(qpos) == pytest.approx(stance)
     assert solver.violations(qpos) == []
 
 
@@ -249,11 +235,11 @@ def test_step_targets_need_a_step(solver: StaticSolver) -> None:
     assert draw.stratum == "step"
     rot = matrix_from_wxyz(draw.quat_w)
     assert classify(solver, draw.pos_w, rot) is None
-    stance = solver.stance_of(draw.witness_qpos)
+    stance = solver.ground_frame_of(draw.witness_qpos)
     assert targets.step_distance[0] <= np.hypot(stance.x, stance.y) <= targets.step_distance[1]
     assert targets.step_yaw[0] <= stance.yaw <= targets.step_yaw[1]
     assert solver.violations(draw.witness_qpos) == []
-    assert classify(solver, *in_stance(stance, draw.pos_w, rot)) is not None
+    assert classify(solver, *to_ground_frame(stance, draw.pos_w, rot)) is not None
 
 
 def test_mirrored_targets_are_equally_feasible() -> None:

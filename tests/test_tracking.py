@@ -11,6 +11,7 @@ from test_cli import fails
 
 from wbc_bench.cli import main
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
+from wbc_bench.episodes.single import _protocol, _row
 from wbc_bench.errors import StoreError
 from wbc_bench.registry import load_controller
 from wbc_bench.results.figures.tracking import write_tracking
@@ -28,7 +29,7 @@ from wbc_bench.robot import load_robot
 from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz
 from wbc_bench.sources import Seen, StampedTarget, load_source
-from wbc_bench.track import _protocol, _row, follow, natural_duration, track
+from wbc_bench.track import follow, natural_duration, track
 
 PERIOD = 0.02  # [s]
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from wbc_bench.episodes.single import episode_of, free_episode
 from wbc_bench.errors import BenchError, SourceError, UnknownNameError
 from wbc_bench.results.tracking import STOOD
 from wbc_bench.sources.slew import Limits
-from wbc_bench.track import episode_of, free_episode
 from wbc_bench.viewer.session import LONGEST, Session
 
 AWAY = np.array([0.06, -0.08, 0.04])  # [m] from the hand, within reach of the arm

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from wbc_bench.manifest import EpisodeManifest, manifest_path, write_manifest
-from wbc_bench.protocol import MAX_PUSHES, load_protocol
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, write_manifest
+from wbc_bench.episodes.protocol import MAX_PUSHES, load_protocol
 
 TOML = """
 name = "tiny"

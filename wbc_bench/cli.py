@@ -67,10 +67,10 @@ class _Evaluation:
         optional: bool = False,
     ) -> "ResultStore":
         """Check everything, then run; with `optional`, what cannot be loaded is skipped with a line."""
+        from wbc_bench.episodes.manifest import manifest_path, read_manifest
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.execution import Job, run_jobs
         from wbc_bench.files import ensure_writable
-        from wbc_bench.manifest import manifest_path, read_manifest
-        from wbc_bench.protocol import find_protocol
         from wbc_bench.results.store import ResultStore
         from wbc_bench.robot import load_robot
 
@@ -141,7 +141,7 @@ class Reach(_Evaluation):
     """Name or .toml file of a reach protocol."""
 
     def run(self) -> None:
-        from wbc_bench.protocol import ReachTargets, find_protocol
+        from wbc_bench.episodes.protocol import ReachTargets, find_protocol
         from wbc_bench.publish import publish
         from wbc_bench.results.analysis import collect
         from wbc_bench.results.tables.reach import reach_table
@@ -169,7 +169,7 @@ class Eval(_Evaluation):
     """First episodes of each replicate; all of them when not given."""
 
     def run(self) -> None:
-        from wbc_bench.protocol import find_protocol
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.results.analysis import collect
         from wbc_bench.results.study import Study
         from wbc_bench.results.tables.paper import paper_table
@@ -208,6 +208,7 @@ class Track:
     """Folder of records, table and figure."""
 
     def run(self) -> None:
+        from wbc_bench.episodes.single import CONDITIONS
         from wbc_bench.files import ensure_writable
         from wbc_bench.publish import publish_tracks
         from wbc_bench.registry import load_controller
@@ -215,7 +216,6 @@ class Track:
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.library import check_source
         from wbc_bench.sources.live import LIVE
-        from wbc_bench.track import CONDITIONS
 
         for option, given in (("--controller", self.controller), ("--source", self.source)):
             if not given:
@@ -239,11 +239,12 @@ class Track:
 
     def _play(self, name: str, spec: str) -> "tuple[Tracked, dict]":
         """Let a controller follow a source of a name; the series, and what the record says beside it."""
+        from wbc_bench.episodes.single import door_protocol
         from wbc_bench.errors import SourceError
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.library import load_source
-        from wbc_bench.track import door_protocol, facts, track
+        from wbc_bench.track import facts, track
 
         controller = load_controller(spec, load_robot())
         source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))
@@ -259,8 +260,9 @@ class Track:
 
     def _drag(self, spec: str) -> "tuple[Tracked, dict]":
         """Let a controller follow what a person drags in a page; as `_play`."""
+        from wbc_bench.episodes.single import UNSCRIPTED, episode_of
         from wbc_bench.sources.live import LIVE
-        from wbc_bench.track import UNSCRIPTED, episode_of, facts
+        from wbc_bench.track import facts
         from wbc_bench.viewer.live import serve
         from wbc_bench.viewer.session import Session
 
@@ -295,7 +297,7 @@ class Live:
     """Let other machines open the page, and move the robot."""
 
     def run(self) -> None:
-        from wbc_bench.track import free_episode
+        from wbc_bench.episodes.single import free_episode
         from wbc_bench.viewer.live import serve
         from wbc_bench.viewer.session import LONGEST, Session
 
@@ -464,10 +466,10 @@ class Latent:
     """Folder of the figure and its numbers; a report beside it shows them."""
 
     def run(self) -> None:
+        from wbc_bench.episodes.manifest import manifest_path, read_manifest
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.files import ensure_writable
         from wbc_bench.introspection import sample_latents
-        from wbc_bench.manifest import manifest_path, read_manifest
-        from wbc_bench.protocol import find_protocol
         from wbc_bench.registry import load_controller, spec_of_replicate
         from wbc_bench.results.figures.latents import summary, write_latents
         from wbc_bench.results.latents import LEAST_EPISODES
@@ -509,8 +511,8 @@ class List:
                 _print_table(Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()())))
             return
 
-        from wbc_bench.manifest import manifest_path
-        from wbc_bench.protocol import find_protocol, protocol_names
+        from wbc_bench.episodes.manifest import manifest_path
+        from wbc_bench.episodes.protocol import find_protocol, protocol_names
         from wbc_bench.registry import controllers
         from wbc_bench.results.metrics import METRICS
         from wbc_bench.results.store import ResultStore
@@ -577,8 +579,8 @@ class ExportController:
 
     def run(self) -> None:
         from wbc_bench.controller import Exportable
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.files import ensure_writable, folder_name
-        from wbc_bench.protocol import find_protocol
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
 
@@ -603,10 +605,10 @@ class Freeze:
     """Processes; the manifest does not depend on it."""
 
     def run(self) -> None:
-        from wbc_bench.freeze import freeze
-        from wbc_bench.manifest import manifest_path
+        from wbc_bench.episodes.freeze import freeze
+        from wbc_bench.episodes.manifest import manifest_path
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.progress import Progress
-        from wbc_bench.protocol import find_protocol
 
         _at_least_one("--workers", self.workers)
         protocol, path = find_protocol(self.name)
@@ -623,10 +625,10 @@ class Verify:
     """Name of a released protocol, or a .toml file."""
 
     def run(self) -> None:
+        from wbc_bench.episodes.manifest import manifest_path
+        from wbc_bench.episodes.protocol import find_protocol
+        from wbc_bench.episodes.verify import verify
         from wbc_bench.errors import ManifestError
-        from wbc_bench.freeze import verify
-        from wbc_bench.manifest import manifest_path
-        from wbc_bench.protocol import find_protocol
 
         protocol, path = find_protocol(self.name)
         checks = verify(protocol, manifest_path(path))
@@ -650,9 +652,9 @@ class Show:
     def run(self) -> None:
         import msgspec
 
+        from wbc_bench.episodes.manifest import manifest_path, read_manifest
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.files import ensure_writable
-        from wbc_bench.manifest import manifest_path, read_manifest
-        from wbc_bench.protocol import find_protocol
         from wbc_bench.publish import target_frame
         from wbc_bench.results.figures.targets import write_targets
 
@@ -713,7 +715,7 @@ class Picture(_Robot):
     def run(self) -> None:
         from wbc_bench.files import ensure_writable
         from wbc_bench.robot import load_robot
-        from wbc_bench.robot.picture import render
+        from wbc_bench.viewer.picture import render
 
         robot = load_robot(self._config())
         ensure_writable(self.out.parent)
@@ -852,10 +854,10 @@ class DemoEval:
 
     def run(self) -> None:
         from wbc_bench.demo import evaluate
+        from wbc_bench.episodes.single import CONDITIONS
         from wbc_bench.progress import Progress
         from wbc_bench.publish import publish_doors
         from wbc_bench.results.doors import door_table, read_doors
-        from wbc_bench.track import CONDITIONS
 
         _at_least_one("--episodes", self.episodes)
         _at_least_one("--workers", self.workers)

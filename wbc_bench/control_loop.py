@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.controller import Controller, ProtocolAware, Target
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
-from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.observation import Sensors
 from wbc_bench.outcomes import Outcome
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import NUM_JOINTS, Scene
 from wbc_bench.simulation import Simulation, State
 

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.protocol import EvalProtocol
+from wbc_bench.episodes.protocol import EvalProtocol
 
 Array = NDArray[np.float64]
 Signal = Literal["proprioception", "ee_pose", "base_pose", "privileged"]

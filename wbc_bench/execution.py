@@ -23,11 +23,11 @@ import pyarrow as pa
 
 from wbc_bench import provenance
 from wbc_bench.controller import Controller
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
-from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.outcomes import EpisodeBatch
 from wbc_bench.progress import Progress
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.registry import load_controller, spec_of_replicate
 from wbc_bench.results import metrics
 from wbc_bench.results.store import ResultStore, Run, RunKey, RunWriter, ShardCost

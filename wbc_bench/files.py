@@ -7,6 +7,15 @@ from pathlib import Path
 from wbc_bench.errors import StoreError
 
 
+def _protocols() -> Path:
+    package = Path(__file__).parent
+    in_wheel = package / "protocols"
+    return in_wheel if in_wheel.is_dir() else package.parent / "protocols"
+
+
+PROTOCOLS = _protocols()  # released protocols, scripts and studies: a wheel holds them beside the code
+
+
 def folder_name(name: str) -> str:
     """A protocol or controller spec as a folder name."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "._@-") else "-" for c in name).strip("-.")

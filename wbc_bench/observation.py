@@ -12,8 +12,8 @@ from wbc_bench.controller import (
     Signal,
     Target,
 )
-from wbc_bench.manifest import EpisodeManifest
-from wbc_bench.protocol import EvalProtocol
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS
 from wbc_bench.rotations import matrix_from_wxyz, rho6

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.episodes.protocol import ReachTargets, load_protocol, protocol_names
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.protocol import PROTOCOL_DIR, ReachTargets, load_protocol, protocol_names
+from wbc_bench.files import PROTOCOLS
 from wbc_bench.results import report
 from wbc_bench.results.analysis import Evaluated, collect_all
 from wbc_bench.results.doors import DoorRun, door_table, read_doors
@@ -91,7 +92,7 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
 
 
 def _write_protocol(name: str, methods: Mapping[str, Evaluated], out: Path, beside: Sequence[str]) -> None:
-    released = load_protocol(PROTOCOL_DIR / f"{name}.toml") if name in protocol_names() else None
+    released = load_protocol(PROTOCOLS / f"{name}.toml") if name in protocol_names() else None
     if released and isinstance(released.targets, ReachTargets):
         write_reach_tables(name, methods, out / "tables")
         write_reach_figures(name, methods, out / "figures")
@@ -101,7 +102,7 @@ def _write_protocol(name: str, methods: Mapping[str, Evaluated], out: Path, besi
         write_study_figures(study, methods, out / "figures")
         write_workspace(study, methods, out / "figures", [spec for spec in beside if spec in methods])
     if released:
-        manifest, _ = read_manifest(released, manifest_path(PROTOCOL_DIR / f"{name}.toml"))
+        manifest, _ = read_manifest(released, manifest_path(PROTOCOLS / f"{name}.toml"))
         write_targets(target_frame(manifest), name, out / "figures")
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from wbc_bench.manifest import EpisodeManifest
-from wbc_bench.protocol import EvalProtocol
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Scene, load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 

@@ -3,8 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import SourceError, UnknownNameError
-from wbc_bench.protocol import PROTOCOL_DIR, EvalProtocol, find_protocol
+from wbc_bench.files import PROTOCOLS
 from wbc_bench.sources.interface import Source
 from wbc_bench.sources.live import LIVE, LiveSource
 from wbc_bench.sources.player import PlayedStream
@@ -14,13 +15,13 @@ from wbc_bench.sources.stream import ADDRESS, StreamSource
 if TYPE_CHECKING:
     from wbc_bench.sources.diffusion.policy import Card, Policy
 
-SOURCE_DIR = PROTOCOL_DIR / "sources"
+SCRIPTS = PROTOCOLS / "scripts"
 POLICY = Path(__file__).parent / "diffusion" / "door.safetensors"  # of `diffusion` without a file
 
 
 def script_names() -> list[str]:
     """Names of the library of scripts."""
-    return sorted(path.stem for path in SOURCE_DIR.glob("*.toml"))
+    return sorted(path.stem for path in SCRIPTS.glob("*.toml"))
 
 
 def source_names() -> list[str]:
@@ -37,7 +38,7 @@ def find_script(name: str) -> Script:
         return load_script(Path(name))
     if name not in script_names():
         raise UnknownNameError("source", name, source_names(), "--source; or give a .toml file")
-    return load_script(SOURCE_DIR / f"{name}.toml")
+    return load_script(SCRIPTS / f"{name}.toml")
 
 
 def check_source(name: str) -> None:

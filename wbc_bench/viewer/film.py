@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from wbc_bench.errors import BenchError, StoreError
 from wbc_bench.results.formatting import CM, DEG
-from wbc_bench.robot.picture import Canvas, add_axes, add_bones, add_connector
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
+from wbc_bench.viewer.picture import Canvas, add_axes, add_bones, add_connector
 from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress
 
 Pixels = NDArray[np.uint8]

@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow as pa
 
 from wbc_bench.control_loop import ControlLoop
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import StoreError
 from wbc_bench.execution import episode_table
-from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.protocol import EvalProtocol, find_protocol
 from wbc_bench.provenance import machine
 from wbc_bench.registry import load_controller, spec_of_replicate
 from wbc_bench.results.store import Run

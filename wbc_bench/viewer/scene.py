@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from wbc_bench.episodes.protocol import Success
 from wbc_bench.errors import BenchError
-from wbc_bench.protocol import Success
 from wbc_bench.robot import Robot
 from wbc_bench.robot import Scene as Surroundings
 from wbc_bench.rotations import wxyz_from_matrix

@@ -4,10 +4,10 @@ import numpy as np
 
 from wbc_bench.control_loop import RUNNING, ControlLoop
 from wbc_bench.controller import Controller, Target
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError
-from wbc_bench.manifest import EpisodeManifest
 from wbc_bench.observation import target_in_base
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.registry import load_controller
 from wbc_bench.results.tracking import Series, Tracked
 from wbc_bench.robot import Robot, load_robot

@@ -22,8 +22,8 @@ from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.settings import TUNED, Weights
 from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
-from wbc_bench.manifest import manifest_path, read_manifest
-from wbc_bench.protocol import find_protocol
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.robot import JOINT_NAMES, Robot, load_robot
 from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
 

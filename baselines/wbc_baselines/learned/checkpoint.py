@@ -20,9 +20,9 @@ from wbc_baselines.learned.estimators import Estimator, make_estimator
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.networks import Actor
 from wbc_bench import provenance
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, UnknownNameError
 from wbc_bench.files import write_atomic
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of
 
 FORMAT = 2

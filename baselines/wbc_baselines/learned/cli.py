@@ -195,8 +195,8 @@ class Imitate:
         from wbc_baselines.learned.estimators import make_estimator
         from wbc_baselines.learned.imitation import METHOD, imitate
         from wbc_baselines.learned.pool import read_pool
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.progress import Progress
-        from wbc_bench.protocol import find_protocol
 
         for name in ("episodes", "rounds", "updates", "workers"):
             if getattr(self, name) < 1:
@@ -240,8 +240,8 @@ class Targets:
 
     def run(self) -> None:
         from wbc_baselines.learned.pool import POOLS, draw_pool, write_pool
+        from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.progress import Progress
-        from wbc_bench.protocol import find_protocol
 
         if self.count < 3:
             raise TrainingError(f"--count {self.count}: valid: 3 or more, one a stratum")

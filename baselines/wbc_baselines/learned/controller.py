@@ -15,7 +15,7 @@ from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Flow, Policy
 from wbc_baselines.learned.reference import advance, initial_reference, pose_errors, rotation_from_rho6
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
-from wbc_bench.protocol import EvalProtocol
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.robot import Robot
 
 REFERENCE_DECAY = 1.0  # [1/s] where no protocol says otherwise. Source: default of wbc_bench.protocol

@@ -13,8 +13,8 @@ from wbc_baselines.learned.pool import TargetPool
 from wbc_baselines.learned.reference import advance, initial_reference, pose_errors, twice_sine
 from wbc_baselines.learned.rewards import Body, Signals, rewards
 from wbc_baselines.learned.starts import Draws, draw_starts, weakened
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.outcomes import STRATA
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, load_robot
 from wbc_bench.rotations import matrix_from_wxyz

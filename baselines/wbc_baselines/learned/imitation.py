@@ -33,9 +33,9 @@ from wbc_bench.controller import (
     ProtocolAware,
     Target,
 )
-from wbc_bench.manifest import EpisodeManifest
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.outcomes import STRATA
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.randomness import stream
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot, load_robot

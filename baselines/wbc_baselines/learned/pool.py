@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
+from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
+from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.outcomes import STRATA
-from wbc_bench.protocol import EvalProtocol, WorkspaceTargets
-from wbc_bench.targets import draw_workspace_target
 
 SEED_OFFSET = 2**62  # added to the protocol's seed: no evaluation draws from such a key
 POOLS = Path(__file__).with_name("pools")  # ships with the package

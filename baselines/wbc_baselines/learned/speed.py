@@ -12,9 +12,9 @@ import mujoco.batch
 import wbc_bench.simulation
 from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.settings import Settings
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.execution import evaluate_shard
-from wbc_bench.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.protocol import EvalProtocol, find_protocol
 
 ROUNDS = 5  # the first is warm-up; methods take turns, so that all meet the same machine
 EPISODES = 50  # of an evaluation, as many as in a shard

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from wbc_baselines.learned.backends.base import Start
 from wbc_baselines.learned.pool import TargetPool
+from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
+from wbc_bench.episodes.randomization import resting_height
 from wbc_bench.outcomes import STRATA
-from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
-from wbc_bench.randomization import resting_height
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
 Array = NDArray[np.float64]

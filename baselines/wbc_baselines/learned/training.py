@@ -33,7 +33,7 @@ from wbc_baselines.learned.pool import TargetPool, read_pool
 from wbc_baselines.learned.settings import Settings, TrainingError
 from wbc_baselines.learned.symmetry import critic_mirror, input_mirror, joint_mirror, privileged_mirror
 from wbc_baselines.learned.teaching import ArmTeaching, Fit, PostureTeaching, Teaching
-from wbc_bench.protocol import EvalProtocol, find_protocol
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 TIMES = ("time/rollout", "time/policy", "time/estimator")  # parts of an iteration, in its metrics

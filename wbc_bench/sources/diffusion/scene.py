@@ -11,14 +11,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.episodes.static_solver import StaticSolver
+from wbc_bench.episodes.targets import classify, solver_of
 from wbc_bench.errors import SourceError
-from wbc_bench.posture import StaticSolver
-from wbc_bench.protocol import EvalProtocol
 from wbc_bench.randomness import stream
 from wbc_bench.robot.mjcf import BODY
 from wbc_bench.rotations import matrix_from_rpy, wxyz_from_matrix
 from wbc_bench.sources.slew import Pose
-from wbc_bench.targets import classify, solver_of
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from wbc_baselines.learned.backends.base import Start, State, columns_of, state_of
 from wbc_baselines.learned.settings import TrainingError
-from wbc_bench.protocol import EvalProtocol
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 from wbc_bench.simulation import places_of
 

@@ -5,12 +5,14 @@ Its digest covers the meaning of the file, not its layout or comments.
 """
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, NoReturn
 
 import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
+from wbc_bench.files import PROTOCOLS
 from wbc_bench.robot import RobotConfig, load_facts
 from wbc_bench.schema import meaning_digest, read_toml
 
@@ -20,7 +22,6 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 Range = tuple[float, float]  # (low, high)
 
 MAX_PUSHES = 2  # columns of a manifest; `load_protocol` refuses a schedule with room for more
-PROTOCOL_DIR = Path(__file__).with_name("protocols")
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -60,6 +61,15 @@ class WorkspaceTargets(_Table, frozen=True, tag="workspace"):
     step_yaw: Range  # [rad] and how far it is turned
     com_margin: NonNegative = 0.02  # [m] of the centre of mass inside the soles' hull
 
+    def mistakes(self, episodes: Episodes) -> Iterator[tuple[str, str]]:
+        """(what is wrong, path of the field), what the types of the fields cannot say."""
+        if self.height[0] < 0:
+            yield f"low {self.height[0]:g} m is below the ground", "targets.height"
+        if self.step_distance[0] < 0:
+            yield f"low {self.step_distance[0]:g} m must not be negative", "targets.step_distance"
+        if not self.weights:
+            yield "no stratum has a weight, valid: arm, posture, step", "targets.weights"
+
 
 class ReachTargets(_Table, frozen=True, tag="reach"):
     """Targets straight ahead over a ladder of heights."""
@@ -76,6 +86,27 @@ class ReachTargets(_Table, frozen=True, tag="reach"):
         """Rungs of the ladder, both ends included where the spacing allows."""
         low, high, spacing = self.heights
         return math.floor((high - low) / spacing + 1e-9) + 1
+
+    @property
+    def num_episodes(self) -> int:
+        """Episodes of the whole ladder."""
+        return len(self.orientations) * len(self.conditions) * self.per_height * self.num_heights
+
+    def mistakes(self, episodes: Episodes) -> Iterator[tuple[str, str]]:
+        """(what is wrong, path of the field), what the types of the fields cannot say."""
+        low, high, _ = self.heights
+        if not 0 <= low <= high:
+            yield f"heights {low:g} to {high:g} m, valid: 0 <= low <= high", "targets.heights"
+        for name in ("orientations", "conditions"):
+            names = getattr(self, name)
+            if not names or len(set(names)) < len(names):
+                yield f"{list(names)} must name at least one, each once", f"targets.{name}"
+        if (episodes.replicates, episodes.per_replicate) != (1, self.num_episodes):
+            yield (
+                f"{episodes.replicates} x {episodes.per_replicate} episodes, "
+                f"the ladder has 1 x {self.num_episodes}",
+                "episodes.per_replicate",
+            )
 
 
 class Randomization(_Table, frozen=True):
@@ -184,7 +215,7 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
     if name.endswith(".toml"):
         path = Path(name)
     else:
-        path = PROTOCOL_DIR / f"{name}.toml"
+        path = PROTOCOLS / f"{name}.toml"
         if not path.exists():
             raise UnknownNameError("protocol", name, protocol_names(), "--protocol")
     return load_protocol(path), path
@@ -192,7 +223,7 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
 
 def protocol_names() -> list[str]:
     """Names of the released protocols."""
-    return sorted(path.stem for path in PROTOCOL_DIR.glob("*.toml"))
+    return sorted(path.stem for path in PROTOCOLS.glob("*.toml"))
 
 
 def _check(protocol: EvalProtocol, path: Path) -> None:
@@ -242,25 +273,5 @@ def _check(protocol: EvalProtocol, path: Path) -> None:
             "push.interval",
         )
 
-    if isinstance(targets, WorkspaceTargets):
-        if targets.height[0] < 0:
-            refuse(f"low {targets.height[0]:g} m is below the ground", "targets.height")
-        if targets.step_distance[0] < 0:
-            refuse(f"low {targets.step_distance[0]:g} m must not be negative", "targets.step_distance")
-        if not targets.weights:
-            refuse("no stratum has a weight, valid: arm, posture, step", "targets.weights")
-    else:
-        low, high, _ = targets.heights
-        if not 0 <= low <= high:
-            refuse(f"heights {low:g} to {high:g} m, valid: 0 <= low <= high", "targets.heights")
-        for name in ("orientations", "conditions"):
-            names = getattr(targets, name)
-            if not names or len(set(names)) < len(names):
-                refuse(f"{list(names)} must name at least one, each once", f"targets.{name}")
-        count = len(targets.orientations) * len(targets.conditions) * targets.per_height * targets.num_heights
-        if (protocol.episodes.replicates, protocol.episodes.per_replicate) != (1, count):
-            refuse(
-                f"{protocol.episodes.replicates} x {protocol.episodes.per_replicate} episodes, "
-                f"the ladder has 1 x {count}",
-                "episodes.per_replicate",
-            )
+    for problem, where in targets.mistakes(protocol.episodes):
+        refuse(problem, where)

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.protocol import MAX_PUSHES, EvalProtocol, Push
+from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Push
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, RobotConfig, load_robot
 

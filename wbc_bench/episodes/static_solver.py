@@ -8,8 +8,7 @@ J4 parallel, J5 and J6 meeting in a point) has four branches. So one end-effecto
 configurations of three dimensions, and that family is searched over a grid of base poses: no starting
 values, no local minima.
 
-Everything here lives in the stance frame: on the ground, below the default base, x forward. `in_stance` and
-`out_of_stance` carry poses to and from a stance that stands somewhere else.
+Everything here lives in the ground frame: on the ground, below the default base, x forward (`ground_frame`).
 """
 
 from functools import cache
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from wbc_bench.episodes.ground_frame import GroundFrame, to_ground_frame
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot, RobotConfig, load_robot, mount_of, tcp_of
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 
@@ -47,26 +47,6 @@ class Witness(NamedTuple):
     margin: (
         float  # smallest normalised distance to a joint limit, a straight elbow or knee, or the soles' edge
     )
-
-
-class Stance(NamedTuple):
-    """Where the robot stands: origin on the ground [m] and heading [rad]."""
-
-    x: float = 0.0
-    y: float = 0.0
-    yaw: float = 0.0
-
-
-def out_of_stance(stance: Stance, pos: Array, rot: Array) -> tuple[Array, Array]:
-    """World pose (..., 3), (..., 3, 3) of a pose given in the stance frame."""
-    turn = matrix_from_rpy(np.array([0.0, 0.0, stance.yaw]))
-    return pos @ turn.T + [stance.x, stance.y, 0.0], turn @ rot
-
-
-def in_stance(stance: Stance, pos: Array, rot: Array) -> tuple[Array, Array]:
-    """Pose (..., 3), (..., 3, 3) in the stance frame of a world pose."""
-    turn = matrix_from_rpy(np.array([0.0, 0.0, stance.yaw]))
-    return (pos - [stance.x, stance.y, 0.0]) @ turn, turn.T @ rot
 
 
 def two_link(first: Array, second: Array, goal: Array) -> tuple[Array, Array, Array]:
@@ -137,7 +117,7 @@ class StaticSolver:
         )  # [m] soles on the ground
         self._ankle = np.array(
             [self._hip[0] + self._thigh[0] + self._shank[0], -foot.z]
-        )  # in the stance frame
+        )  # in the ground frame
         half_width = xyz["abad_L_Joint"][1] + xyz["hip_L_Joint"][1] + xyz["knee_L_Joint"][1] + foot.y[1]
         # the flat soles side by side: their hull is a rectangle
         self.hull_low = np.array([self._ankle[0] + foot.x[0], -half_width])  # (2,) [m]
@@ -250,7 +230,7 @@ class StaticSolver:
     # ---- search --------------------------------------------------------------------------------------------
 
     def solve_arm(self, pos: Array, rot: Array) -> Witness | None:
-        """A configuration with base and legs at the default posture of a pose in the stance frame."""
+        """A configuration with base and legs at the default posture of a pose in the ground frame."""
         return self._best(self._default, pos, rot)
 
     def solve_posture(self, pos: Array, rot: Array) -> Witness | None:
@@ -364,18 +344,18 @@ class StaticSolver:
         _, torque, unbalanced = self.static_forces(qpos)
         return float((np.abs(torque) / self.robot.effort).max()) if unbalanced < 1e-3 else np.inf
 
-    def stance_of(self, qpos: Array) -> Stance:
+    def ground_frame_of(self, qpos: Array) -> GroundFrame:
         """Where a configuration (21,) in the world stands, by the position and heading of its soles."""
         self._kinematics(qpos)
         left, right = (self.model.site(f"sole_{side}").id for side in "LR")
         forward = self.data.site_xmat[[left, right]][:, [0, 3]].sum(0)
         forward /= np.linalg.norm(forward)
         x, y = self.data.site_xpos[[left, right], :2].mean(0) - self._ankle[0] * forward
-        return Stance(float(x), float(y), float(np.arctan2(forward[1], forward[0])))
+        return GroundFrame(float(x), float(y), float(np.arctan2(forward[1], forward[0])))
 
     def violations(self, qpos: Array) -> list[str]:
         """What is wrong with a configuration (21,) in the world, by MuJoCo alone; empty if it is feasible."""
-        pos, rot = in_stance(self.stance_of(qpos), qpos[:3], matrix_from_wxyz(qpos[3:7]))
+        pos, rot = to_ground_frame(self.ground_frame_of(qpos), qpos[:3], matrix_from_wxyz(qpos[3:7]))
         qpos = np.concatenate([pos, wxyz_from_matrix(rot), qpos[7:]])
         wrong = []
         if not self._within_limits(qpos[7:], slice(None)):

@@ -9,8 +9,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ManifestError
-from wbc_bench.protocol import EvalProtocol
 
 
 @dataclass(frozen=True)
