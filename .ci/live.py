@@ -16,7 +16,7 @@ from joblib import Parallel, delayed
 
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
-from wbc_bench.execution import evaluate_shard
+from wbc_bench.evaluation.shard import evaluate_shard
 from wbc_bench.registry import spec_of_replicate
 from wbc_bench.results.analysis import collect, stood
 from wbc_bench.results.store import ResultStore

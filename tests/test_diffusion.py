@@ -11,15 +11,16 @@ import torch
 import zarr
 from test_cli import fails
 
-from wbc_bench import demo
 from wbc_bench.cli import main
 from wbc_bench.episodes.single import door_protocol, episode_of
 from wbc_bench.errors import SourceError, StoreError
+from wbc_bench.evaluation import doors as demo
+from wbc_bench.evaluation.simulation import Simulation
+from wbc_bench.evaluation.tracking import track
 from wbc_bench.registry import load_controller
 from wbc_bench.results.doors import door_table, read_doors
 from wbc_bench.robot import build_spec, load_robot
 from wbc_bench.rotations import matrix_from_rotvec
-from wbc_bench.simulation import Simulation
 from wbc_bench.sources import Seen, load_source
 from wbc_bench.sources.diffusion import demonstrations, denoising, poses, training
 from wbc_bench.sources.diffusion.demonstrations import (
@@ -42,7 +43,6 @@ from wbc_bench.sources.diffusion.scene import CLOSED, GRIP, STANDOFF, Door, Door
 from wbc_bench.sources.diffusion.source import DiffusionSource
 from wbc_bench.sources.library import POLICY
 from wbc_bench.sources.slew import Pose
-from wbc_bench.track import track
 
 DOOR = Door(x=0.68, y=0.1, z=1.1, yaw=0.1, angle=0.6)
 

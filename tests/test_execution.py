@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from tiny_protocol import write_tiny
 
-from wbc_bench import execution
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import load_protocol
 from wbc_bench.errors import ControllerError, StoreError, UnknownNameError
-from wbc_bench.execution import Engine, ExecutionError, Job, evaluate_shard, run_jobs
+from wbc_bench.evaluation import workers as workers_module
+from wbc_bench.evaluation.execution import Job, run_jobs
+from wbc_bench.evaluation.shard import evaluate_shard
+from wbc_bench.evaluation.workers import Engine, ExecutionError
 from wbc_bench.outcomes import Outcome
 from wbc_bench.results.store import ResultStore
 
@@ -117,7 +119,7 @@ def test_a_shard_does_not_depend_on_the_others(tiny, reference, tmp_path):
 def test_nothing_is_computed_twice(tiny, reference, tmp_path, monkeypatch, capsys):
     spec, _ = reference
     run_jobs([job(tiny, spec)], ResultStore(tmp_path), Engine())
-    monkeypatch.setattr(execution, "evaluate_shard", None)
+    monkeypatch.setattr(workers_module, "evaluate_shard", None)
     run_jobs([job(tiny, spec)], ResultStore(tmp_path), Engine())
     assert "kept" in capsys.readouterr().err
 
@@ -205,7 +207,7 @@ def test_dask_starts_its_own_cluster(tiny, reference, tmp_path):
 
 def test_no_scheduler_at_the_address(tiny, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(execution, "CONNECT_TIMEOUT", 0.3)
+    monkeypatch.setattr(workers_module, "CONNECT_TIMEOUT", 0.3)
     with pytest.raises(ExecutionError, match="no dask scheduler answers at 'tcp:"):
         run_jobs([job(tiny, "hold")], ResultStore(tmp_path), Engine.parse("dask=tcp://127.0.0.1:9", 1))
 
@@ -243,7 +245,7 @@ def test_changed_code_does_not_join_old_shards(tiny, tmp_path):
     spec = write_controller(tmp_path, "edited", "pass")
     store = ResultStore(tmp_path / "out")
     stop = iter(range(10))
-    original = execution.evaluate_shard
+    original = workers_module.evaluate_shard
 
     def interrupted(*arguments):
         if next(stop) == 1:
@@ -251,7 +253,7 @@ def test_changed_code_does_not_join_old_shards(tiny, tmp_path):
         return original(*arguments)
 
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(execution, "evaluate_shard", interrupted)
+        patch.setattr(workers_module, "evaluate_shard", interrupted)
         run_jobs([job(tiny, spec)], store, Engine())
     assert store.unfinished()[0][1] == 1
     write_controller(tmp_path, "edited", "q = q + 0.1")

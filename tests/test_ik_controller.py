@@ -21,9 +21,9 @@ from wbc_bench.controller import Observation, Proprioception, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import UnknownNameError
+from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.outcomes import Outcome
 from wbc_bench.robot import load_robot
-from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz
 
 ROBOT = load_robot()
@@ -397,10 +397,10 @@ def test_stands_and_does_not_depend_on_the_batch(two_seconds: EvalProtocol, calm
     drawn = read_manifest(smoke, manifest_path(path))[0].take(slice(0, 2))
     rows = calm_rows(2, target_pos_w=drawn.target_pos_w, target_quat_w=drawn.target_quat_w)
     controller = make(ROBOT)
-    together = evaluate(controller, two_seconds, rows)
+    together = rollout(controller, two_seconds, rows)
     assert (together.steps == two_seconds.num_steps).all()
     assert not set(together.outcome) & {Outcome.FELL, Outcome.INVALID, Outcome.ILLEGAL_CONTACT}
     for i in range(2):
-        alone = evaluate(controller, two_seconds, rows.take(slice(i, i + 1)))
+        alone = rollout(controller, two_seconds, rows.take(slice(i, i + 1)))
         for name in ("position_error", "orientation_error", "action", "ee_pos_w", "infeasible_steps"):
             np.testing.assert_array_equal(getattr(alone, name)[0], getattr(together, name)[i], err_msg=name)

@@ -14,9 +14,9 @@ from wbc_baselines.ik.stance import Stance, base_from_sole, measured_stance, yaw
 from wbc_baselines.ik.stepping import Swing, choose, landing, outside, pressure, solve_leg
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
+from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.outcomes import TERMINATED
 from wbc_bench.robot import load_robot
-from wbc_bench.rollout import evaluate
 
 ROBOT = load_robot()
 MODEL = WholeBodyModel(ROBOT)
@@ -174,5 +174,5 @@ def test_steps_save_pushed_episodes() -> None:
     falls = []
     for variant in ("standing", ""):
         controller = make(ROBOT, variant)
-        falls.append(int(np.isin(evaluate(controller, protocol, rows).outcome, TERMINATED).sum()))
+        falls.append(int(np.isin(rollout(controller, protocol, rows).outcome, TERMINATED).sum()))
     assert falls[1] <= falls[0] - 2

@@ -21,14 +21,14 @@ from wbc_bench.controller import DEPLOYABLE, Observation, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import BenchError
-from wbc_bench.introspection import sample_latents
-from wbc_bench.observation import Sensors
+from wbc_bench.evaluation.latents import sample_latents
+from wbc_bench.evaluation.observation import Sensors
+from wbc_bench.evaluation.rollout import rollout
+from wbc_bench.evaluation.simulation import Simulation
 from wbc_bench.registry import load_controller
 from wbc_bench.results.figures import latents
 from wbc_bench.robot import load_robot
-from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import geodesic_angle
-from wbc_bench.simulation import Simulation
 
 COUNT = 4
 
@@ -140,7 +140,7 @@ def test_reference_starts_at_the_observed_error_and_decays(stream):
 def test_the_protocol_sets_the_decay(smoke: EvalProtocol, calm_rows: CalmRows):
     slower = msgspec.structs.replace(smoke, reference_decay=0.5)
     engine = Recording("no_latent")
-    evaluate(make("no_latent", engine), slower, calm_rows(2))
+    rollout(make("no_latent", engine), slower, calm_rows(2))
     first, second = (values["observation"][:, 57] for values in engine.seen[:2])
     torch.testing.assert_close(first - second, torch.full((2,), 0.01), atol=1e-5, rtol=0)
 
@@ -217,7 +217,7 @@ def test_command_is_default_plus_scaled_action(stream):
 def test_another_period_is_refused(smoke: EvalProtocol, calm_rows: CalmRows):
     slower = msgspec.structs.replace(smoke, physics=msgspec.structs.replace(smoke.physics, decimation=20))
     with pytest.raises(BenchError, match=r"every 0\.02 s"):
-        evaluate(make("no_latent"), slower, calm_rows(2))
+        rollout(make("no_latent"), slower, calm_rows(2))
 
 
 def test_one_seed_a_replicate(capsys, tmp_path, monkeypatch):
@@ -263,8 +263,8 @@ def test_the_study_says_which_seeds_are_missing(capsys, tmp_path, monkeypatch):
 
 def test_a_real_episode(smoke: EvalProtocol, tmp_path, calm_rows: CalmRows):
     controller = load_controller(f"learned:{write(tmp_path, 'transformer_gru')}", load_robot())
-    a = evaluate(controller, smoke, calm_rows(3))
-    b = evaluate(controller, smoke, calm_rows(3))
+    a = rollout(controller, smoke, calm_rows(3))
+    b = rollout(controller, smoke, calm_rows(3))
     assert a.steps.min() > 5 and np.array_equal(a.action, b.action, equal_nan=True)
 
 
@@ -297,7 +297,7 @@ def test_the_latent_of_an_estimator_is_sampled_with_the_error_it_saw(method, col
     protocol, path = find_protocol("smoke_v1")
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 3)
     samples = sample_latents(make(method), protocol, rows)
-    batch = evaluate(make(method), protocol, rows)
+    batch = rollout(make(method), protocol, rows)
     assert samples.latent.shape == (batch.steps.sum(), columns) and np.ptp(samples.latent, axis=0).all()
     for row, episode in enumerate(rows.episode):
         own = samples.episode == episode
@@ -311,7 +311,7 @@ def test_the_latent_is_what_the_actor_reads():
     protocol, path = find_protocol("smoke_v1")
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 2)
     controller = make("transformer_gru", policy)
-    evaluate(controller, protocol, rows)
+    rollout(controller, protocol, rows)
     window = policy.found[-1]["window"]
     state = policy.seen[-1]["state"]
     with torch.inference_mode():

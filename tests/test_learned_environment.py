@@ -31,12 +31,12 @@ from wbc_bench.episodes import randomization  # noqa: E402
 from wbc_bench.episodes.manifest import EpisodeManifest  # noqa: E402
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
 from wbc_bench.errors import ManifestError  # noqa: E402
-from wbc_bench.observation import Sensors  # noqa: E402
+from wbc_bench.evaluation.observation import Sensors  # noqa: E402
+from wbc_bench.evaluation.simulation import Simulation  # noqa: E402
 from wbc_bench.outcomes import STRATA  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 from wbc_bench.rotations import matrix_from_wxyz  # noqa: E402
-from wbc_bench.simulation import Simulation  # noqa: E402
 
 PROTOCOL = find_protocol("ablation_v1")[0]
 POOL = read_pool(PROTOCOL)
@@ -113,7 +113,7 @@ def test_observations_are_the_evaluations():
     rows = manifest_of(draws.start, draws.target)
     rows.target_pos_w[:] = episode.target_pos_w.numpy()
     sensors = Sensors(protocol, rows, frozenset({"proprioception", "ee_pose", "privileged"}))
-    from wbc_bench.simulation import State as Truth
+    from wbc_bench.evaluation.simulation import State as Truth
 
     truth = Truth(
         base_pos_w=state.qpos[:, :3].double().numpy(),

@@ -14,9 +14,9 @@ from wbc_baselines.learned.policy import Policy
 from wbc_bench.cli import main
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError
+from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import RobotConfig, load_robot
-from wbc_bench.rollout import evaluate
 
 STEPS = 500
 
@@ -76,7 +76,7 @@ def test_both_drive_the_robot_alike(exported, method, smoke: EvalProtocol, calm_
     ours = load_controller(f"learned:{exported[method].with_name(f'{method}@0.safetensors')}", robot)
     theirs = load_controller(f"onnx:{exported[method]}", robot)
     assert theirs.info.signals == ours.info.signals
-    a, b = (evaluate(controller, smoke, calm_rows(2)) for controller in (ours, theirs))
+    a, b = (rollout(controller, smoke, calm_rows(2)) for controller in (ours, theirs))
     np.testing.assert_array_equal(a.steps, b.steps)
     np.testing.assert_allclose(
         a.action[:, :20], b.action[:, :20], atol=1e-4

@@ -28,9 +28,9 @@ from wbc_baselines.learned.imitation import (  # noqa: E402
 from wbc_baselines.learned.inputs import VELOCITY  # noqa: E402
 from wbc_baselines.learned.networks import Actor  # noqa: E402
 from wbc_baselines.learned.symmetry import input_mirror  # noqa: E402
-from wbc_bench.control_loop import ControlLoop  # noqa: E402
 from wbc_bench.controller import ControllerInfo, JointCommand  # noqa: E402
 from wbc_bench.episodes.protocol import find_protocol  # noqa: E402
+from wbc_bench.evaluation.control_loop import ControlLoop  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
 
 JOINTS, ACTION = slice(6, 20), slice(34, 48)  # of the observation: positions; the action of the step before

@@ -34,13 +34,13 @@ from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
 from wbc_baselines.learned.speed import measure  # noqa: E402
 from wbc_baselines.learned.starts import draw_starts  # noqa: E402
 from wbc_baselines.learned.training import Trainer, advantages, make_environment  # noqa: E402
-from wbc_bench import simulation  # noqa: E402
 from wbc_bench.episodes.protocol import Noise, Push, find_protocol  # noqa: E402
 from wbc_bench.errors import UnknownNameError  # noqa: E402
+from wbc_bench.evaluation import simulation  # noqa: E402
+from wbc_bench.evaluation.rollout import rollout  # noqa: E402
 from wbc_bench.randomness import stream  # noqa: E402
 from wbc_bench.registry import load_controller  # noqa: E402
 from wbc_bench.robot import load_robot  # noqa: E402
-from wbc_bench.rollout import evaluate  # noqa: E402
 
 TINY = Settings(
     "no_latent",
@@ -310,7 +310,7 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
             history.push(env.seen.term)
 
     controller = load_controller(f"learned:{path}", load_robot(protocol.robot))
-    found = evaluate(controller, protocol, manifest_of(start, target))
+    found = rollout(controller, protocol, manifest_of(start, target))
     lasted = min(25, int(found.steps.min()))
     assert lasted > 10
     np.testing.assert_allclose(

@@ -9,9 +9,9 @@ from conftest import CalmRows
 from wbc_bench.controller import SIGNALS, Observation, Signal
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.observation import Sensors
+from wbc_bench.evaluation.observation import Sensors
+from wbc_bench.evaluation.simulation import State
 from wbc_bench.rotations import geodesic_angle, matrix_from_rotvec, matrix_from_rpy, matrix_from_wxyz, rho6
-from wbc_bench.simulation import State
 
 COUNT = 4
 ALL = frozenset(SIGNALS)

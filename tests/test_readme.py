@@ -5,9 +5,9 @@ from pathlib import Path
 
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
+from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
-from wbc_bench.rollout import evaluate
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -20,7 +20,7 @@ def test_the_controller_of_the_readme_runs(tmp_path: Path) -> None:
     protocol, path = find_protocol("smoke_v1")
     rows, _ = read_manifest(protocol, manifest_path(path))
     controller = load_controller(f"{file}:Lean", load_robot(protocol.robot))
-    batch = evaluate(controller, protocol, rows.take(slice(2)))
+    batch = rollout(controller, protocol, rows.take(slice(2)))
     assert (batch.steps > 5).all()
     assert abs(batch.action[:, 0, 9]).max() > 0.1
 

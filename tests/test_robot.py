@@ -10,6 +10,7 @@ import pytest
 
 from wbc_bench.errors import BenchError, ProtocolError, UnknownNameError
 from wbc_bench.robot import JOINT_NAMES, Robot, RobotConfig, build_spec, load_facts, load_robot
+from wbc_bench.robot.facts import FACTS_FILE
 from wbc_bench.rotations import wxyz_from_matrix, xyzw_from_wxyz
 from wbc_bench.viewer import picture
 
@@ -244,7 +245,7 @@ def test_unknown_names(config: RobotConfig, message: str) -> None:
 
 
 def test_a_wrong_facts_file_names_the_field(tmp_path: Path) -> None:
-    text = Path(str(picture.__file__)).with_name("tron1_l5.toml").read_text()
+    text = FACTS_FILE.read_text()
     wrong = tmp_path / "facts.toml"
     wrong.write_text(text.replace("mass = 9.585", 'mass = "heavy"'))
     with pytest.raises(ProtocolError, match=r"facts.toml.*links\[0\]\.mass"):

@@ -12,10 +12,10 @@ from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Sign
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, Termination, find_protocol
 from wbc_bench.errors import ControllerError
+from wbc_bench.evaluation.rollout import RUNNING, _classify, rollout
 from wbc_bench.outcomes import EpisodeBatch, Outcome
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import Robot, load_robot
-from wbc_bench.rollout import RUNNING, _classify, evaluate
 from wbc_bench.rotations import matrix_from_wxyz
 
 Rows = slice | np.ndarray
@@ -112,7 +112,7 @@ def test_an_early_end_is_final(how: Outcome) -> None:
 
 
 def test_every_episode_has_one_outcome(smoke: EvalProtocol, disturbed: EpisodeManifest) -> None:
-    batch = evaluate(Recorder(), smoke, disturbed)
+    batch = rollout(Recorder(), smoke, disturbed)
     assert all(isinstance(outcome, Outcome) for outcome in batch.outcome)
 
 
@@ -124,7 +124,7 @@ def test_targets_held_missed_and_left(short: EvalProtocol, calm_rows: CalmRows) 
         q[:, 8] += 0.3 if step > 5 else 0.0
         return q
 
-    begin, end = evaluate(Recorder(turn), short, calm_rows(3, **still)).ee_pos_w[0, [3, -1]]
+    begin, end = rollout(Recorder(turn), short, calm_rows(3, **still)).ee_pos_w[0, [3, -1]]
     targets = np.array([end, begin, begin])
     targets[1, 1] += 0.2
     assert np.linalg.norm(end - begin) > 0.08
@@ -132,7 +132,7 @@ def test_targets_held_missed_and_left(short: EvalProtocol, calm_rows: CalmRows) 
     def outcomes(orientation: float) -> list[Outcome]:
         success = msgspec.structs.replace(short.success, orientation=orientation)
         protocol = msgspec.structs.replace(short, success=success)
-        return list(evaluate(Recorder(turn), protocol, calm_rows(3, target_pos_w=targets, **still)).outcome)
+        return list(rollout(Recorder(turn), protocol, calm_rows(3, target_pos_w=targets, **still)).outcome)
 
     assert outcomes(orientation=0.5) == [Outcome.SUCCESS, Outcome.MISSED, Outcome.DRIFTED]
     assert outcomes(orientation=1e-3) == [Outcome.MISSED] * 3  # both errors count
@@ -146,7 +146,7 @@ def test_falling_over(smoke: EvalProtocol, calm_rows: CalmRows) -> None:
     spin[1, 4] = 6.0  # [rad/s] nose down
     protocol = msgspec.structs.replace(smoke, termination=Termination(illegal_contact=False))
     controller = Recorder(signals=("base_pose",))
-    batch = evaluate(controller, protocol, calm_rows(2, base_vel=spin))
+    batch = rollout(controller, protocol, calm_rows(2, base_vel=spin))
     assert batch.outcome[1] == Outcome.FELL
     last = batch.steps[1]
     assert 5 < last < batch.steps[0] <= protocol.num_steps
@@ -164,13 +164,13 @@ def test_illegal_contact(smoke: EvalProtocol, calm_rows: CalmRows) -> None:
     """A robot lying on its side, had tilt and height been allowed."""
     lying = msgspec.structs.replace(smoke, termination=Termination(tilt=3.2, base_height=0.0))
     spin = np.array([[0, 0, 0, 5.0, 0, 0]])
-    batch = evaluate(Recorder(), lying, calm_rows(1, base_vel=spin))
+    batch = rollout(Recorder(), lying, calm_rows(1, base_vel=spin))
     assert batch.outcome[0] == Outcome.ILLEGAL_CONTACT
     assert batch.steps[0] < smoke.num_steps
 
 
 def test_after_the_end_there_is_nothing(smoke: EvalProtocol, disturbed: EpisodeManifest) -> None:
-    batch = evaluate(follower(), smoke, disturbed)
+    batch = rollout(follower(), smoke, disturbed)
     assert (batch.steps < smoke.num_steps).any() and (batch.steps > 0).all()
     for name in SERIES:
         series = getattr(batch, name)
@@ -185,9 +185,9 @@ def test_commands_after_the_end_are_ignored(smoke: EvalProtocol, disturbed: Epis
     def careless(robot: Robot, step: int, obs: Observation, target: Target, q: np.ndarray) -> np.ndarray:
         return np.where(obs.active[:, None], proportional(robot, step, obs, target, q), np.nan)
 
-    batch = evaluate(Recorder(careless, ("proprioception", "ee_pose")), smoke, disturbed)
+    batch = rollout(Recorder(careless, ("proprioception", "ee_pose")), smoke, disturbed)
     assert Outcome.FELL in batch.outcome
-    same(batch, evaluate(follower(), smoke, disturbed))
+    same(batch, rollout(follower(), smoke, disturbed))
 
 
 # controllers that fail
@@ -205,15 +205,15 @@ def test_nan_invalidates_one_episode_only(
             q[2, 5] = bad
         return q
 
-    batch = evaluate(Recorder(failing, ("proprioception", "ee_pose")), short, disturbed)
+    batch = rollout(Recorder(failing, ("proprioception", "ee_pose")), short, disturbed)
     others = np.array([0, 1, 3, 4, 5])
     assert batch.outcome[2] == Outcome.INVALID and Outcome.INVALID not in batch.outcome[others]
     assert batch.steps[2] == (8 if bad == 1e300 else 7)  # finite: MuJoCo refuses it, after the fact
-    same(batch, evaluate(follower(), short, disturbed), others, others)
+    same(batch, rollout(follower(), short, disturbed), others, others)
 
 
 def test_nan_from_the_start(short: EvalProtocol, disturbed: EpisodeManifest) -> None:
-    batch = evaluate(Recorder(lambda robot, step, obs, target, q: q * np.nan), short, disturbed)
+    batch = rollout(Recorder(lambda robot, step, obs, target, q: q * np.nan), short, disturbed)
     assert (batch.outcome == Outcome.INVALID).all() and (batch.steps == 0).all()
     assert all(np.isnan(getattr(batch, name)).all() for name in SERIES)
     assert (batch.infeasible_steps == 0).all()
@@ -225,7 +225,7 @@ def test_a_diverged_simulation_is_invalid(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log
     speed = np.zeros((3, 6))
     speed[0, 0], speed[2, 2] = 1e12, 3e3
-    batch = evaluate(Recorder(), short, calm_rows(3, base_vel=speed))
+    batch = rollout(Recorder(), short, calm_rows(3, base_vel=speed))
     assert list(batch.outcome) == [Outcome.INVALID, Outcome.MISSED, Outcome.INVALID]
     assert list(batch.steps) == [1, short.num_steps, 1]
 
@@ -236,7 +236,7 @@ def test_a_wrong_shape_names_the_right_one(
 ) -> None:
     controller = Recorder(lambda robot, step, obs, target, q: np.zeros(shape))
     with pytest.raises(ControllerError, match=r"'recorder' returned .*expected \(6, 14\)") as caught:
-        evaluate(controller, short, disturbed)
+        rollout(controller, short, disturbed)
     assert str(shape) in str(caught.value)
 
 
@@ -244,7 +244,7 @@ def test_a_wrong_control_period(short: EvalProtocol, disturbed: EpisodeManifest)
     with pytest.raises(
         ControllerError, match=r"'recorder' runs every 0.01 s, protocol smoke_v1 asks for 0.02 s"
     ):
-        evaluate(Recorder(period=0.01), short, disturbed)
+        rollout(Recorder(period=0.01), short, disturbed)
 
 
 # independence
@@ -256,10 +256,10 @@ def test_a_wrong_control_period(short: EvalProtocol, disturbed: EpisodeManifest)
 def test_an_episode_does_not_depend_on_its_batch(
     smoke: EvalProtocol, disturbed: EpisodeManifest, make: Callable
 ) -> None:
-    whole = evaluate(make(), smoke, disturbed)
+    whole = rollout(make(), smoke, disturbed)
     for chosen in ([3], [4, 1], [5, 4, 3, 2, 1, 0]):
-        same(whole, evaluate(make(), smoke, disturbed.take(np.array(chosen))), np.array(chosen))
-    same(whole, evaluate(make(), smoke, disturbed))
+        same(whole, rollout(make(), smoke, disturbed.take(np.array(chosen))), np.array(chosen))
+    same(whole, rollout(make(), smoke, disturbed))
 
 
 # what is recorded, and what is shown
@@ -269,7 +269,7 @@ def test_errors_are_those_of_the_true_hand(short: EvalProtocol, disturbed: Episo
     """Recomputed from what a controller without noise was shown at the next step."""
     rows = dataclasses.replace(disturbed, noise_scale=np.zeros(6))
     controller = Recorder(proportional, ("proprioception", "ee_pose", "base_pose"))
-    batch = evaluate(controller, short, rows)
+    batch = rollout(controller, short, rows)
     assert batch.steps.sum() > 100
     for step, (obs, _) in enumerate(controller.seen[1:]):
         for i in np.flatnonzero(obs.active):
@@ -288,7 +288,7 @@ def test_actions_are_the_normalised_commands(short: EvalProtocol, calm_rows: Cal
     robot = load_robot()
     actions = np.random.default_rng(0).uniform(-0.1, 0.1, (short.num_steps, 2, 14))
     controller = Recorder(lambda robot, step, obs, target, q: robot.command_of(actions[step]))
-    batch = evaluate(controller, short, calm_rows(2))
+    batch = rollout(controller, short, calm_rows(2))
     np.testing.assert_allclose(batch.action, actions.swapaxes(0, 1), atol=1e-14)
     assert np.abs(robot.command_of(actions) - robot.default_q).max() > 0.05  # scaled, not copied
 
@@ -303,7 +303,7 @@ def test_infeasible_steps_are_counted_while_the_episode_runs(
 
     spin = np.zeros((3, 6))
     spin[2, 4] = 6.0
-    batch = evaluate(Stuck(), smoke, calm_rows(3, base_vel=spin))
+    batch = rollout(Stuck(), smoke, calm_rows(3, base_vel=spin))
     assert batch.outcome[2] in (Outcome.FELL, Outcome.ILLEGAL_CONTACT)
     assert list(batch.infeasible_steps) == [0, batch.steps[1], batch.steps[2]]
 
@@ -314,8 +314,8 @@ def test_pushes_come_at_their_step(short: EvalProtocol, calm_rows: CalmRows) -> 
     time[0], velocity[0] = [0.1, 0.3], [0.4, -0.2, 0.1, 0.3]
     time[1, 0], velocity[1, :2] = 0.214, [-0.3, 0.0]  # rounds to the nearest step
     calm, pushed = Recorder(signals=("base_pose",)), Recorder(signals=("base_pose",))
-    evaluate(calm, short, calm_rows(3))
-    evaluate(pushed, short, calm_rows(3, push_time=time, push_vel=velocity))
+    rollout(calm, short, calm_rows(3))
+    rollout(pushed, short, calm_rows(3, push_time=time, push_vel=velocity))
     change = np.array(
         [
             b[0].base_pose.lin_vel_w - a[0].base_pose.lin_vel_w
@@ -335,7 +335,7 @@ def test_pushes_come_at_their_step(short: EvalProtocol, calm_rows: CalmRows) -> 
 
 def test_a_controller_is_shown_what_it_declared(short: EvalProtocol, disturbed: EpisodeManifest) -> None:
     blind = Recorder()
-    batch = evaluate(blind, short, disturbed)
+    batch = rollout(blind, short, disturbed)
     np.testing.assert_array_equal(blind.episodes, disturbed.episode)
     assert len(blind.seen) == short.num_steps == batch.steps.max()
     for step, (obs, target) in enumerate(blind.seen):

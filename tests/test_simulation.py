@@ -8,9 +8,9 @@ from conftest import CalmRows
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
+from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.robot import Robot, load_robot
 from wbc_bench.rotations import wxyz_from_matrix
-from wbc_bench.simulation import Simulation, State
 
 GRAVITY = 9.81  # [m/s^2]
 

@@ -13,6 +13,8 @@ from wbc_bench.cli import main
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.episodes.single import _protocol, _row
 from wbc_bench.errors import StoreError
+from wbc_bench.evaluation.rollout import rollout
+from wbc_bench.evaluation.tracking import follow, natural_duration, track
 from wbc_bench.registry import load_controller
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.tracking import (
@@ -26,10 +28,8 @@ from wbc_bench.results.tracking import (
     write_track,
 )
 from wbc_bench.robot import load_robot
-from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz
 from wbc_bench.sources import Seen, StampedTarget, load_source
-from wbc_bench.track import follow, natural_duration, track
 
 PERIOD = 0.02  # [s]
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -151,7 +151,7 @@ def test_a_target_that_rests_is_an_evaluation(condition: str) -> None:
     protocol = _protocol(0.6, seed=3)
     row = dataclasses.replace(_row(protocol, condition), target_pos_w=pos_w[None])
     run = follow(Swing(), Still(pos_w), protocol, row)
-    batch = evaluate(Swing(), protocol, row)
+    batch = rollout(Swing(), protocol, row)
     steps = int(batch.steps[0])
     assert len(run.time) == steps > 10
     np.testing.assert_array_equal(run.ee_pos_w[1:], batch.ee_pos_w[0, : steps - 1])

@@ -10,7 +10,8 @@ import pytest
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.execution import Engine, Job, run_jobs
+from wbc_bench.evaluation.execution import Job, run_jobs
+from wbc_bench.evaluation.workers import Engine
 from wbc_bench.results.store import ResultStore, Run
 from wbc_bench.viewer import rerun as rerun_module
 from wbc_bench.viewer.moment import Moment, Skeleton

@@ -16,7 +16,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, subcommand
 from wbc_bench.errors import BenchError, UnknownNameError
 
 if TYPE_CHECKING:
-    from wbc_bench.execution import Engine
+    from wbc_bench.evaluation.workers import Engine
     from wbc_bench.results.store import ResultStore
     from wbc_bench.results.tracking import Tracked
     from wbc_bench.robot import Robot, RobotConfig
@@ -53,7 +53,7 @@ class _Evaluation:
     """Evaluate again what is already there."""
 
     def _engine(self) -> "Engine":
-        from wbc_bench.execution import Engine
+        from wbc_bench.evaluation.workers import Engine
 
         _at_least_one("--workers", self.workers)
         return Engine.parse(self.engine, self.workers)
@@ -69,7 +69,7 @@ class _Evaluation:
         """Check everything, then run; with `optional`, what cannot be loaded is skipped with a line."""
         from wbc_bench.episodes.manifest import manifest_path, read_manifest
         from wbc_bench.episodes.protocol import find_protocol
-        from wbc_bench.execution import Job, run_jobs
+        from wbc_bench.evaluation.execution import Job, run_jobs
         from wbc_bench.files import ensure_writable
         from wbc_bench.results.store import ResultStore
         from wbc_bench.robot import load_robot
@@ -241,10 +241,10 @@ class Track:
         """Let a controller follow a source of a name; the series, and what the record says beside it."""
         from wbc_bench.episodes.single import door_protocol
         from wbc_bench.errors import SourceError
+        from wbc_bench.evaluation.tracking import facts, track
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.library import load_source
-        from wbc_bench.track import facts, track
 
         controller = load_controller(spec, load_robot())
         source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))
@@ -261,8 +261,8 @@ class Track:
     def _drag(self, spec: str) -> "tuple[Tracked, dict]":
         """Let a controller follow what a person drags in a page; as `_play`."""
         from wbc_bench.episodes.single import UNSCRIPTED, episode_of
+        from wbc_bench.evaluation.tracking import facts
         from wbc_bench.sources.live import LIVE
-        from wbc_bench.track import facts
         from wbc_bench.viewer.live import serve
         from wbc_bench.viewer.session import Session
 
@@ -468,8 +468,8 @@ class Latent:
     def run(self) -> None:
         from wbc_bench.episodes.manifest import manifest_path, read_manifest
         from wbc_bench.episodes.protocol import find_protocol
+        from wbc_bench.evaluation.latents import sample_latents
         from wbc_bench.files import ensure_writable
-        from wbc_bench.introspection import sample_latents
         from wbc_bench.registry import load_controller, spec_of_replicate
         from wbc_bench.results.figures.latents import summary, write_latents
         from wbc_bench.results.latents import LEAST_EPISODES
@@ -771,7 +771,7 @@ class DemoRecord:
     """Processes; the file does not depend on it."""
 
     def run(self) -> None:
-        from wbc_bench.demo import record
+        from wbc_bench.evaluation.doors import record
         from wbc_bench.files import ensure_writable
         from wbc_bench.progress import Progress
 
@@ -853,8 +853,8 @@ class DemoEval:
     """Folder of the record and the table."""
 
     def run(self) -> None:
-        from wbc_bench.demo import evaluate
         from wbc_bench.episodes.single import CONDITIONS
+        from wbc_bench.evaluation.doors import evaluate
         from wbc_bench.progress import Progress
         from wbc_bench.publish import publish_doors
         from wbc_bench.results.doors import door_table, read_doors

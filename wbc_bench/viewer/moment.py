@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.control_loop import ControlLoop
+from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.rotations import geodesic_angle
 
 Array = NDArray[np.float64]

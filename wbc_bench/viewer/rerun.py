@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from wbc_bench.control_loop import ControlLoop
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import StoreError
-from wbc_bench.execution import episode_table
+from wbc_bench.evaluation.control_loop import ControlLoop
+from wbc_bench.evaluation.rollout import rollout
+from wbc_bench.evaluation.shard import episode_table
 from wbc_bench.provenance import machine
 from wbc_bench.registry import load_controller, spec_of_replicate
 from wbc_bench.results.store import Run
 from wbc_bench.robot import Robot, load_robot
-from wbc_bench.rollout import evaluate
 from wbc_bench.rotations import matrix_from_wxyz
 from wbc_bench.viewer.moment import PUSH_SECONDS, Moment, moment_of
 
@@ -138,7 +138,7 @@ def _watched(
         if progress is not None:
             progress(loop.step, protocol.num_steps, "running the episode again")
 
-    batch = evaluate(load_controller(spec, robot), protocol, rows, watch)
+    batch = rollout(load_controller(spec, robot), protocol, rows, watch)
     seen = moments[: int(batch.steps[row]) + 1]
     return [moment for moment in seen if np.isfinite(moment.qpos).all()], episode_table(rows, batch)
 

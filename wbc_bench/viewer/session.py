@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from wbc_bench.control_loop import RUNNING, ControlLoop
 from wbc_bench.controller import Controller, Target
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError
-from wbc_bench.observation import target_in_base
+from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
+from wbc_bench.evaluation.observation import target_in_base
+from wbc_bench.evaluation.tracking import outcome_of, seen_of
 from wbc_bench.registry import load_controller
 from wbc_bench.results.tracking import Series, Tracked
 from wbc_bench.robot import Robot, load_robot
@@ -15,7 +16,6 @@ from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.sources import Source, StampedTarget, load_source, to_world
 from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.live import LiveSource
-from wbc_bench.track import outcome_of, seen_of
 from wbc_bench.viewer.moment import PUSH_SECONDS, Array, Moment, moment_of
 
 LONGEST = 600.0  # [s] of an episode without an end: the noise of a whole one is drawn in advance

@@ -24,7 +24,6 @@ from wbc_baselines.learned.policy import flow_of
 from wbc_baselines.learned.pool import TargetPool
 from wbc_baselines.learned.starts import draw_starts, weakened
 from wbc_baselines.learned.symmetry import input_mirror, joint_mirror
-from wbc_bench.control_loop import ControlLoop
 from wbc_bench.controller import (
     Controller,
     ControllerInfo,
@@ -35,6 +34,7 @@ from wbc_bench.controller import (
 )
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.outcomes import STRATA
 from wbc_bench.randomness import stream
 from wbc_bench.registry import load_controller

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import mujoco.batch
 
-import wbc_bench.simulation
 from wbc_baselines.learned import checkpoint
 from wbc_baselines.learned.settings import Settings
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
-from wbc_bench.execution import evaluate_shard
+from wbc_bench.evaluation import simulation
+from wbc_bench.evaluation.shard import evaluate_shard
 
 ROUNDS = 5  # the first is warm-up; methods take turns, so that all meet the same machine
 EPISODES = 50  # of an evaluation, as many as in a shard
@@ -99,7 +99,7 @@ def _engine_clocks() -> Iterator[None]:
     """Have simulations of training and evaluation made from here on count their engine's time."""
     from wbc_baselines.learned.backends import cpu
 
-    places = (cpu, wbc_bench.simulation)
+    places = (cpu, simulation)
     for place in places:
         place.Batch = EngineClock
     try:

@@ -6,7 +6,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_bench.simulation import Places
+from wbc_bench.evaluation.simulation import Places
 
 MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10 ms steps counts as diverged
 

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from wbc_baselines.learned.backends.base import Start, State, columns_of, state_of
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.simulation import FATAL_WARNINGS, places_of
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
-from wbc_bench.simulation import FATAL_WARNINGS, places_of
 
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
 _STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")

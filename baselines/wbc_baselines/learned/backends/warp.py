@@ -20,8 +20,8 @@ from torch import Tensor
 from wbc_baselines.learned.backends.base import Start, State, columns_of, state_of
 from wbc_baselines.learned.settings import TrainingError
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.simulation import places_of
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
-from wbc_bench.simulation import places_of
 
 # Per world: 8 contacts of the soles, and room for what meets in a fall; 3 rows a contact, 14 joint limits.
 CONTACTS, ROWS = 32, 128

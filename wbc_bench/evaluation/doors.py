@@ -13,6 +13,7 @@ from wbc_bench import provenance
 from wbc_bench.controller import Controller
 from wbc_bench.episodes.single import door_protocol, episode_of
 from wbc_bench.errors import SourceError
+from wbc_bench.evaluation.tracking import Moment, follow
 from wbc_bench.files import ensure_writable
 from wbc_bench.registry import load_controller
 from wbc_bench.results.doors import write_doors
@@ -24,7 +25,6 @@ from wbc_bench.sources.diffusion.scene import CLOSED, Door, draw_door
 from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.library import find_policy
 from wbc_bench.sources.slew import Pose
-from wbc_bench.track import Moment, follow
 
 Array = NDArray[np.float64]
 DURATION = 12.0  # [s] of an episode: the expert takes 7 to 11

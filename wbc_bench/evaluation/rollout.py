@@ -5,16 +5,16 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.control_loop import RUNNING, ControlLoop
 from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
 from wbc_bench.outcomes import EpisodeBatch, Outcome
 from wbc_bench.robot import NUM_JOINTS
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
 
 
-def evaluate(
+def rollout(
     controller: Controller,
     protocol: EvalProtocol,
     rows: EpisodeManifest,

@@ -10,10 +10,10 @@ from wbc_bench.controller import Controller, ProtocolAware, Target
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
-from wbc_bench.observation import Sensors
+from wbc_bench.evaluation.observation import Sensors
+from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.outcomes import Outcome
 from wbc_bench.robot import NUM_JOINTS, Scene
-from wbc_bench.simulation import Simulation, State
 
 RUNNING = ""
 

@@ -14,10 +14,10 @@ from wbc_bench.controller import (
 )
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.simulation import State
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS
 from wbc_bench.rotations import matrix_from_wxyz, rho6
-from wbc_bench.simulation import State
 
 Array = NDArray[np.float64]
 _WIDTHS = {  # signals with noise, in the order of their columns

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench import provenance
-from wbc_bench.control_loop import RUNNING, ControlLoop
 from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.single import CONDITIONS, UNSCRIPTED, _protocol, _row, episode_of
 from wbc_bench.errors import UnknownNameError
-from wbc_bench.observation import target_in_base
+from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
+from wbc_bench.evaluation.observation import target_in_base
+from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
-from wbc_bench.simulation import Simulation, State
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
 from wbc_bench.sources.player import PlayedStream
 from wbc_bench.sources.scripted import ScriptedSource

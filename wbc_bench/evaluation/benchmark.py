@@ -9,7 +9,7 @@ from mujoco.batch import Batch
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
-from wbc_bench.execution import SHARD_EPISODES, evaluate_shard
+from wbc_bench.evaluation.shard import SHARD_EPISODES, evaluate_shard
 from wbc_bench.robot import load_robot
 
 SHARDS = 6

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from wbc_bench.control_loop import ControlLoop
 from wbc_bench.controller import Controller, ShowsLatent
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
+from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.results.latents import Samples
 
 

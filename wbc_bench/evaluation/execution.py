@@ -1,0 +1,143 @@
+"""Runs that a store does not hold yet: the shards that are missing are computed, kept, and merged."""
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from wbc_bench import provenance
+from wbc_bench.controller import Controller
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.shard import SHARD_EPISODES
+from wbc_bench.evaluation.workers import Engine, Result, Task, results
+from wbc_bench.progress import Progress
+from wbc_bench.registry import load_controller, spec_of_replicate
+from wbc_bench.results.store import ResultStore, Run, RunKey, RunWriter
+from wbc_bench.robot import load_robot
+
+
+@dataclass(frozen=True)
+class Job:
+    """Some replicates of one protocol under one controller."""
+
+    protocol: EvalProtocol
+    manifest: EpisodeManifest
+    manifest_sha256: str
+    spec: str
+    replicates: Sequence[int]
+    episodes: int  # of each replicate
+
+
+def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool = False) -> list[Run]:
+    """Evaluate what the store does not hold yet; finished shards of an interrupted evaluation are kept.
+
+    Raises:
+        StoreError: the store holds other answers under the same name, is in use or is full.
+        ControllerError: a controller cannot be built or breaks the interface.
+        ExecutionError: workers cannot be started or keep dying.
+    """
+    with ExitStack() as stack:
+        runs = []
+        for job in jobs:
+            built: dict[str, tuple[Controller, str]] = {}  # spec -> controller, digest of its software
+            for replicate in job.replicates:
+                # one controller may meet all replicates, or another one each
+                spec = spec_of_replicate(job.spec, replicate)
+                if spec not in built:
+                    controller = load_controller(spec, load_robot(job.protocol.robot))
+                    built[spec] = controller, provenance.software_digest(controller)
+                runs.append(_Run(job, spec, *built[spec], replicate, store, redo))
+                stack.callback(runs[-1].writer.close)
+        tasks = (task for number, run in enumerate(runs) for task in run.tasks(number))
+        shared = {
+            **{"workers": engine.workers, "engine": engine.name},
+            **{"versions": provenance.versions(), "machine": provenance.machine()},
+        }
+        shared["git_commit"], shared["git_dirty"] = provenance.commit()
+        for run in runs:
+            run.report_kept()
+            run.finish_if_whole(shared)  # killed between the last shard and the merge
+        missing = sum(len(run.writer.rows(shard)) for run in runs for shard in run.writer.missing)
+        if missing:
+            with Progress("episodes") as progress:
+                for result in results(tasks, engine):
+                    run = runs[result.run]
+                    run.accept(result)
+                    done = progress.done + len(result.episodes)
+                    progress.update(done, missing, f"{run.job.spec} replicate {run.replicate}")
+                    run.finish_if_whole(shared)
+        return [run.writer.finished for run in runs if run.writer.finished]
+
+
+class _Run:
+    """One run of a job while it is evaluated."""
+
+    def __init__(
+        self,
+        job: Job,
+        spec: str,
+        controller: Controller,
+        software: str,
+        replicate: int,
+        store: ResultStore,
+        redo: bool,
+    ) -> None:
+        self.job, self.replicate = job, replicate
+        self._spec = spec  # of the controller that meets this replicate
+        self._controller = controller
+        self._rows = job.manifest.of_replicate(replicate, job.episodes)
+        self._started = float("inf")
+        key = RunKey(
+            protocol=job.protocol.name,
+            protocol_digest=job.protocol.digest,
+            manifest_sha256=job.manifest_sha256,
+            controller=job.spec,
+            replicate=replicate,
+            requested=len(self._rows),
+            shard_episodes=SHARD_EPISODES,
+            software_sha256=software,
+        )
+        self.writer = RunWriter(store, key, redo)
+
+    def tasks(self, number: int) -> Iterator[Task]:
+        for shard in self.writer.missing:
+            rows = self._rows.take(np.asarray(self.writer.rows(shard)))
+            yield Task(number, shard, self._spec, self.job.protocol, rows)
+
+    def report_kept(self) -> None:
+        """Say what is not evaluated again, and whether other code made it: nobody may take it for new."""
+        writer, name = self.writer, f"{self.job.spec} replicate {self.replicate}"
+        if writer.finished:
+            record = writer.finished.record
+            line = f"{name}: kept, evaluated {record.created}"
+            if record.software_sha256 != writer.key.software_sha256:
+                line += " by other code or packages than now; --redo evaluates it again"
+            print(line, file=sys.stderr)
+        elif writer.resumed:
+            print(f"{name}: resumed after {writer.resumed} of {writer.num_shards} shards", file=sys.stderr)
+
+    def accept(self, result: Result) -> None:
+        self._started = min(self._started, result.started)
+        self.writer.write(result.shard, result.episodes, result.cost)
+
+    def finish_if_whole(self, shared: dict[str, Any]) -> None:
+        if self.writer.finished or self.writer.missing:
+            return
+        now, info = time.time(), self._controller.info
+        self.writer.finish(
+            {
+                "controller_name": info.name,
+                "signals": sorted(info.signals),
+                "source": info.source,
+                "checkpoint_sha256": getattr(self._controller, "checkpoint_sha256", None),
+                "wall_time_s": round(max(0.0, now - self._started), 3),  # 0 when only the merge was left
+                "created": datetime.fromtimestamp(now, UTC).isoformat(timespec="seconds"),
+                **shared,
+            }
+        )

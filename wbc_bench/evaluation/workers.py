@@ -1,0 +1,168 @@
+"""Who computes which shard: this process, processes of this machine, or a dask cluster.
+
+Workers return rows; only the client writes.
+"""
+
+import os
+import resource
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
+from wbc_bench.evaluation.shard import evaluate_shard
+from wbc_bench.results.store import ShardCost
+
+ENGINES = ("loky", "dask")
+CONNECT_TIMEOUT = 10.0  # [s] for a dask scheduler to answer
+MAX_DEATHS = 3  # in a row without a finished shard: then the shard kills its worker, not bad luck
+
+
+class ExecutionError(BenchError):
+    """Workers that cannot be started, or that keep dying."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where shards run."""
+
+    workers: int = 1
+    name: str = "loky"
+    address: str | None = None  # of a dask scheduler; None starts a cluster on this machine
+
+    @classmethod
+    def parse(cls, text: str, workers: int) -> "Engine":
+        """`loky`, `dask` or `dask=ADDRESS`.
+
+        Raises: UnknownNameError for any other engine.
+        """
+        name, _, address = text.partition("=")
+        if name not in ENGINES or (address and name != "dask"):
+            raise UnknownNameError("engine", text, (*ENGINES, "dask=ADDRESS"), "--engine")
+        return cls(workers, name, address or None)
+
+
+class Task(NamedTuple):
+    """One shard, as it travels to a worker."""
+
+    run: int
+    shard: int
+    spec: str
+    protocol: EvalProtocol
+    rows: EpisodeManifest
+
+
+class Result(NamedTuple):
+    """One shard, as it comes back."""
+
+    run: int
+    shard: int
+    episodes: pa.Table
+    started: float  # [s] Unix time
+    cost: ShardCost
+
+
+def _work(task: Task) -> Result:
+    """One shard, on the worker."""
+    started = time.time()
+    try:
+        episodes = evaluate_shard(task.spec, task.protocol, task.rows)
+    except BenchError as error:  # every subclass as one that survives pickling
+        raise ControllerError(str(error)) from None
+    rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MiB]
+    return Result(task.run, task.shard, episodes, started, ShardCost(time.time() - started, rss))
+
+
+def _work_for(client: int, task: Task) -> Result:
+    """One shard, on a worker that does not outlive its client."""
+    _leave_with(client)
+    return _work(task)
+
+
+@cache
+def _leave_with(client: int) -> None:
+    """End this process once its parent is gone: loky's workers outlive a killed one, holding their memory."""
+
+    def watch() -> None:
+        while os.getppid() == client:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def results(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
+    """Results in the order in which they are ready."""
+    if engine.name == "dask":
+        return _on_dask(tasks, engine)
+    if engine.workers == 1:
+        return map(_work, tasks)
+    return _on_loky(tasks, engine.workers)
+
+
+def _on_loky(tasks: Iterable[Task], workers: int) -> Iterator[Result]:
+    from joblib import Parallel, delayed, parallel_config
+    from joblib.externals.loky.process_executor import BrokenProcessPool
+
+    pending = {(task.run, task.shard): task for task in tasks}
+    deaths = 0
+    while pending:
+        try:
+            with parallel_config("loky", inner_max_num_threads=1):
+                # max_nbytes: rows are small, and a temporary folder of memory maps would outlive a kill
+                options: Any = {"batch_size": 1, "max_nbytes": None}
+                parallel = Parallel(workers, return_as="generator_unordered", **options)
+                client = os.getpid()
+                results: Any = parallel(delayed(_work_for)(client, task) for task in list(pending.values()))
+                for result in results:
+                    del pending[result.run, result.shard]
+                    deaths = 0
+                    yield result
+        except BrokenProcessPool as error:  # one dead worker takes the whole pool down
+            deaths += 1
+            if deaths == MAX_DEATHS:
+                raise ExecutionError(
+                    f"a worker died {deaths} times in a row ({len(pending)} shards missing); "
+                    "finished shards are kept: run again, with fewer --workers if memory ran out"
+                ) from error
+
+
+def _on_dask(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
+    try:
+        from distributed import Client, KilledWorker, LocalCluster, as_completed
+    except ImportError as error:
+        raise ExecutionError(
+            "--engine dask needs the package distributed: pip install wbc-bench[cluster]"
+        ) from error
+    with ExitStack() as stack:
+        if engine.address is None:
+            options: Any = {"dashboard_address": None}  # no web server
+            cluster = LocalCluster(n_workers=engine.workers, threads_per_worker=1, **options)
+            where: Any = stack.enter_context(cluster)
+        else:
+            where = engine.address
+        try:
+            client = stack.enter_context(Client(where, timeout=CONNECT_TIMEOUT))
+        except (OSError, ValueError) as error:
+            raise ExecutionError(f"no dask scheduler answers at '{engine.address}': {error}") from error
+        queue = iter(tasks)
+        # A window instead of everything at once: rows travel when they are needed.
+        window = 2 * max(len(client.scheduler_info()["workers"]), engine.workers)
+        futures = as_completed(client.submit(_work, task, pure=False) for task in islice(queue, window))
+        for future in futures:
+            try:
+                yield future.result()
+            except KilledWorker as error:
+                raise ExecutionError(
+                    f"dask gave up on a shard that killed its workers: {error}; finished shards are kept"
+                ) from error
+            futures.update(client.submit(_work, task, pure=False) for task in islice(queue, 1))
