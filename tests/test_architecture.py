@@ -127,6 +127,6 @@ def test_results_need_neither_physics_nor_learning():
 def test_the_command_line_starts_light():
     """`wbc-bench --help` must not wait for numpy, let alone MuJoCo."""
     heavy = (*HEAVY, "numpy", "pandas", "scipy", "matplotlib", "joblib", "sklearn")
-    code = f"import sys, wbc_bench.cli; print(*(m for m in {heavy} if m in sys.modules))"
+    code = f"import sys, wbc_bench.cli.main; print(*(m for m in {heavy} if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""

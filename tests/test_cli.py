@@ -12,7 +12,7 @@ import pytest
 from test_execution import write_controller
 from tiny_protocol import write_tiny
 
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 from wbc_bench.episodes.manifest import manifest_path
 
 

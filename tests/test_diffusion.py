@@ -11,7 +11,7 @@ import torch
 import zarr
 from test_cli import fails
 
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 from wbc_bench.episodes.single import door_protocol, episode_of
 from wbc_bench.errors import SourceError, StoreError
 from wbc_bench.evaluation import doors as demo

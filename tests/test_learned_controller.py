@@ -16,7 +16,7 @@ from wbc_baselines.learned import checkpoint, inputs
 from wbc_baselines.learned.controller import LearnedController
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Policy
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 from wbc_bench.controller import DEPLOYABLE, Observation, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
@@ -250,7 +250,7 @@ def test_one_seed_a_replicate(capsys, tmp_path, monkeypatch):
 
 
 def test_the_study_says_which_seeds_are_missing(capsys, tmp_path, monkeypatch):
-    from wbc_bench.cli import _loadable
+    from wbc_bench.cli.evaluate import _loadable
 
     monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path)
     write(tmp_path, "gru", 1)

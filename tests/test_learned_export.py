@@ -11,7 +11,7 @@ from learned import networks, write
 from wbc_baselines.learned.export import OnnxEngine
 from wbc_baselines.learned.methods import METHODS
 from wbc_baselines.learned.policy import Policy
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError
 from wbc_bench.evaluation.rollout import rollout

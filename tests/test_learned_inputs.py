@@ -6,7 +6,7 @@ import torch
 
 from wbc_baselines.learned import inputs, reference
 from wbc_baselines.learned.normalizer import FLOOR, Normalizer
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 from wbc_bench.rotations import geodesic_angle, matrix_from_rotvec, rho6
 
 N = 4

@@ -9,7 +9,7 @@ import pytest
 import zmq
 from test_cli import fails
 
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.episodes.single import _protocol, _row
 from wbc_bench.errors import StoreError

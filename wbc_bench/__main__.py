@@ -1,6 +1,6 @@
 """`python -m wbc_bench` is `wbc-bench`."""
 
-from wbc_bench.cli import main
+from wbc_bench.cli.main import main
 
 if __name__ == "__main__":
     main()

@@ -9,7 +9,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, subcommand
 
 from wbc_baselines.learned.settings import Settings, TrainingError
-from wbc_bench.cli import run_command
+from wbc_bench.cli.common import run_command
 
 RUNS = Path("runs")
 DEFAULTS = Settings("transformer_gru")  # of what trains methods given otherwise

@@ -1,0 +1,152 @@
+"""`wbc-bench list`, `export` and `bench`: what is installed, and what can be done with it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional
+
+from wbc_bench.cli.common import print_table
+from wbc_bench.errors import UnknownNameError
+
+BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
+INPUTS = (
+    "wbc_bench.inputs"  # entry points: name -> a callable that returns rows (vector, columns, term, unit)
+)
+
+
+@dataclass(frozen=True)
+class List:
+    """List controllers, protocols, sources, metrics, benchmarks and runs."""
+
+    results: Path = Path("results")
+    """Folder of the records."""
+    inputs: FlagCreatePairsOff[bool] = False
+    """Instead, what stands in which column of the inputs of learned controllers."""
+
+    def run(self) -> None:
+        from importlib.metadata import entry_points
+
+        from wbc_bench.results.table import Table
+
+        if self.inputs:
+            for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
+                header = ("Vector", "Columns", "Size", "Term", "Unit")
+                print_table(Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()())))
+            return
+
+        from wbc_bench.episodes.manifest import manifest_path
+        from wbc_bench.episodes.protocol import find_protocol, protocol_names
+        from wbc_bench.registry import controllers
+        from wbc_bench.results.metrics import METRICS
+        from wbc_bench.results.store import ResultStore
+        from wbc_bench.sources.library import find_script, script_names
+
+        rows = [(name, point.value) for name, point in sorted(controllers().items())]
+        print_table(Table("controllers", "Controllers", ("Name", "Comes from"), tuple(rows)))
+        rows = []
+        for name in protocol_names():
+            protocol, path = find_protocol(name)
+            episodes = protocol.episodes
+            size = f"{episodes.replicates} x {episodes.per_replicate} x {episodes.horizon:g} s"
+            frozen = "yes" if manifest_path(path).exists() else "no"
+            rows.append((name, size, frozen, protocol.digest[:12], protocol.description))
+        header = ("Name", "Replicates x episodes", "Frozen", "Digest", "Description")
+        print_table(Table("protocols", "Protocols", header, tuple(rows)))
+        scripts = [find_script(name) for name in script_names()]
+        rows = [
+            *((script.name, script.path.__struct_config__.tag, script.description) for script in scripts),
+            ("stream", "ZeroMQ", "Targets from another program, see wbc_bench/sources/STREAM.md."),
+            ("diffusion", "policy", "Pushes a door shut, see wbc_bench/sources/diffusion/README.md."),
+        ]
+        print_table(Table("sources", "Sources", ("Name", "Kind", "Description"), tuple(rows)))
+        rows = [(metric.name, metric.unit, metric.better, metric.source) for metric in METRICS]
+        print_table(Table("metrics", "Metrics", ("Name", "Unit", "Better", "Source"), tuple(rows)))
+        rows = [(point.name, point.value) for point in entry_points(group=BENCHMARKS)]
+        print_table(Table("benchmarks", "Benchmarks", ("Name", "Comes from"), tuple(rows)))
+        store = ResultStore(self.results)
+        rows = [
+            (
+                *(run.record.protocol, run.record.controller, str(run.record.replicate)),
+                *(f"{run.record.completed}/{run.record.requested}", run.record.created),
+                (run.record.git_commit or "no commit")[:12] + ("+" if run.record.git_dirty else ""),
+            )
+            for run in store.runs()
+        ]
+        rows += [
+            (
+                path.parents[1].name,
+                path.parent.name,
+                path.name.removeprefix("replicate_"),
+                f"{shards} shards",
+                "",
+                "",
+            )
+            for path, shards in store.unfinished()
+        ]
+        header = ("Protocol", "Controller", "Replicate", "Episodes", "Created (UTC)", "Commit")
+        print_table(Table("runs", f"Runs under {self.results}", header, tuple(rows)))
+
+
+@dataclass(frozen=True)
+class ExportController:
+    """Write a controller to a file for other runtimes, normalisers, window and recurrent state included."""
+
+    controller: str = tyro.MISSING
+    """Controller that can be exported: name:variant."""
+    format: str = "onnx"
+    """Format of the file."""
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """File to write; named after the controller when not given."""
+    protocol: str = "ablation_v1"
+    """Protocol whose robot it drives."""
+
+    def run(self) -> None:
+        from wbc_bench.controller import Exportable
+        from wbc_bench.episodes.protocol import find_protocol
+        from wbc_bench.files import ensure_writable, folder_name
+        from wbc_bench.registry import load_controller
+        from wbc_bench.robot import load_robot
+
+        robot = load_robot(find_protocol(self.protocol)[0].robot)
+        controller = load_controller(self.controller, robot)
+        formats = controller.formats if isinstance(controller, Exportable) else ()
+        if not isinstance(controller, Exportable) or self.format not in formats:
+            raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
+        path = self.out or Path(f"{folder_name(self.controller)}.{self.format}")
+        ensure_writable(path.parent)
+        controller.export(path, self.format)
+        print(path)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Time what the installed packages offer to be timed, e.g. the solvers of the IK controller."""
+
+    names: Positional[tuple[str, ...]] = ()
+    """Benchmarks; all of them when not given."""
+    out: Path | None = None
+    """Also write <name>.csv and <name>.md into this folder."""
+
+    def run(self) -> None:
+        from importlib.metadata import entry_points
+
+        from wbc_bench.files import ensure_writable
+        from wbc_bench.results.table import Table
+
+        found = {point.name: point for point in entry_points(group=BENCHMARKS)}
+        for name in self.names:
+            if name not in found:
+                raise UnknownNameError("benchmark", name, found, f"entry points of '{BENCHMARKS}'")
+        if self.out:
+            ensure_writable(self.out)
+        for name in self.names or sorted(found):
+            frame = found[name].load()()
+            cells = [
+                tuple(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) for row in frame.values
+            ]
+            table = Table(name, f"Benchmark {name}", tuple(map(str, frame.columns)), tuple(cells), data=frame)
+            print_table(table)
+            if self.out:
+                table.write(self.out)

@@ -1,0 +1,98 @@
+"""`wbc-bench replay` and `film`: an episode of a stored run again."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from wbc_bench.cli.common import UsageError
+
+
+@dataclass(frozen=True)
+class _Again:
+    name: Annotated[Positional[str], tyro.conf.arg(name="run")]
+    """Folder of a run, or <protocol>/<controller>/replicate_<k> of the records."""
+    episode: int = tyro.MISSING
+    """Number of the episode inside its replicate."""
+    results: Path = Path("results")
+    """Folder of the records."""
+    protocol: str | None = None
+    """File of the run's protocol, where that is not a released one."""
+
+    def _check_folder(self, path: Path) -> None:
+        """Before minutes are spent on what cannot be written."""
+        from wbc_bench.files import ensure_writable
+
+        ensure_writable(path.parent)
+
+
+@dataclass(frozen=True)
+class Replay(_Again):
+    """Run one episode of a stored run again, compare it with its record, and write it as a page to watch."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("replay.html")
+    """Page to write; it needs no network."""
+
+    def run(self) -> None:
+        from wbc_bench.progress import Progress
+        from wbc_bench.results.store import ResultStore
+        from wbc_bench.viewer.replay import write_html
+
+        self._check_folder(self.out)
+        run = ResultStore(self.results).find(self.name)
+        with Progress("steps") as progress:
+            again = write_html(run, self.episode, self.out, self.protocol, progress.update)
+        print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}\n{self.out}")
+
+
+@dataclass(frozen=True)
+class Film(_Again):
+    """Run one episode of a stored run again and film it, or draw successive pictures of it side by side."""
+
+    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Film to write (.mp4)."""
+    strip: Path | None = None
+    """Strip of pictures to write (.png), and its caption beside it (.txt)."""
+    times: tuple[float, ...] | None = None
+    """Seconds of the pictures of a strip; six, evenly over the episode, when not given."""
+
+    def run(self) -> None:
+        from matplotlib import image
+
+        try:
+            import mujoco  # noqa: F401
+        except (ImportError, AttributeError) as error:  # it loads the library of MUJOCO_GL at once
+            chosen = os.environ.get("MUJOCO_GL", "")
+            raise UsageError(
+                f"MuJoCo cannot draw with MUJOCO_GL={chosen} ({error}): install it or unset that"
+            ) from error
+
+        from wbc_bench.files import write_atomic
+        from wbc_bench.progress import Progress
+        from wbc_bench.results.store import ResultStore
+        from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
+        from wbc_bench.viewer.rerun import rerun
+
+        if self.out is None and self.strip is None:
+            raise UsageError("nothing to write: give -o FILE.mp4, --strip FILE.png or both")
+        for path, suffix in ((self.out, ".mp4"), (self.strip, ".png")):
+            if path and path.suffix != suffix:
+                raise UsageError(f"'{path}': valid: a file that ends in {suffix}")
+            if path:
+                self._check_folder(path)
+        run = ResultStore(self.results).find(self.name)
+        with Progress("steps") as progress:
+            again = rerun(run, self.episode, self.protocol, progress.update)
+        print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}")
+        if self.out:
+            with Progress("pictures") as progress:
+                write_film_of(again, self.out, progress.update)
+            print(self.out)
+        if self.strip:
+            pixels = strip_of(again, self.times)
+            image.imsave(self.strip, pixels, format="png", pil_kwargs={"pnginfo": None})
+            write_atomic(self.strip.with_suffix(".txt"), strip_caption(again, self.times).encode())
+            print(self.strip)

@@ -1,0 +1,99 @@
+"""`wbc-bench compare`, `report` and `latent`: what the records say."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import Positional
+
+from wbc_bench.cli.common import UsageError, print_table
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Compare two evaluated controllers on the episodes that both met."""
+
+    a: Positional[str]
+    """Controller."""
+    b: Positional[str]
+    """Controller it is compared with."""
+    protocol: str = "ablation_v1"
+    """Protocol of the runs."""
+    results: Path = Path("results")
+    """Folder of the records."""
+    out: Path | None = None
+    """Also write the table into this folder."""
+
+    def run(self) -> None:
+        from wbc_bench.files import ensure_writable
+        from wbc_bench.results.analysis import collect
+        from wbc_bench.results.store import ResultStore
+        from wbc_bench.results.tables.pairs import compare_table
+        from wbc_bench.results.tables.write import write_compare_table
+
+        evaluated = collect(ResultStore(self.results).runs(self.protocol))
+        print_table(compare_table(self.protocol, evaluated, self.a, self.b))
+        if self.out:
+            ensure_writable(self.out)
+            write_compare_table(self.protocol, evaluated, self.a, self.b, self.out)
+
+
+@dataclass(frozen=True)
+class Report:
+    """Make every table, every figure and report.html anew from the records; nothing is evaluated."""
+
+    results: Path = Path("results")
+    """Folder of the records."""
+    out: Path | None = None
+    """Where to write; the folder of the records when not given."""
+    workspace: tuple[str, ...] = ()
+    """Controllers whose success over the workspace is drawn side by side; the best two when not given."""
+
+    def run(self) -> None:
+        from wbc_bench.publish import publish
+        from wbc_bench.results.store import ResultStore
+
+        for path in publish(ResultStore(self.results), self.out or self.results, self.workspace):
+            print(path)
+
+
+@dataclass(frozen=True)
+class Latent:
+    """Draw the latent of a controller's estimator by phase of the task: t-SNE and LDA side by side."""
+
+    controller: str = tyro.MISSING
+    """Controller that shows its latent, e.g. learned:METHOD@SEED."""
+    protocol: str = "ablation_v1"
+    """Name of a released protocol, or a .toml file with its manifest beside it."""
+    episodes: int = 40
+    """First episodes of replicate 0; half of them are held out to test the discriminant."""
+    seed: int = 0
+    """Of the halves, of the points drawn and of t-SNE."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("results/figures")
+    """Folder of the figure and its numbers; a report beside it shows them."""
+
+    def run(self) -> None:
+        from wbc_bench.episodes.manifest import manifest_path, read_manifest
+        from wbc_bench.episodes.protocol import find_protocol
+        from wbc_bench.evaluation.latents import sample_latents
+        from wbc_bench.files import ensure_writable
+        from wbc_bench.registry import load_controller, spec_of_replicate
+        from wbc_bench.results.figures.latents import summary, write_latents
+        from wbc_bench.results.latents import LEAST_EPISODES
+        from wbc_bench.robot import load_robot
+
+        protocol, path = find_protocol(self.protocol)
+        most = protocol.episodes.per_replicate
+        if not LEAST_EPISODES <= self.episodes <= most:
+            raise UsageError(f"--episodes {self.episodes}: valid: {LEAST_EPISODES} to {most}")
+        if self.seed < 0:
+            raise UsageError(f"--seed {self.seed}: valid: 0 or more")
+        manifest, _ = read_manifest(protocol, manifest_path(path))
+        spec = spec_of_replicate(self.controller, 0)
+        controller = load_controller(spec, load_robot(protocol.robot))
+        rows = manifest.of_replicate(0, self.episodes)
+        samples = sample_latents(controller, protocol, rows)
+        ensure_writable(self.out)
+        found, paths = write_latents(controller.info.name, protocol.name, samples, self.seed, self.out)
+        print(*summary(samples, found), *paths, sep="\n")
