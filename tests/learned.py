@@ -4,10 +4,11 @@ from pathlib import Path
 
 import torch
 
-from wbc_baselines.learned import checkpoint
-from wbc_baselines.learned.estimators import Batch, Estimator, make_estimator
-from wbc_baselines.learned.methods import METHODS
-from wbc_baselines.learned.networks import Actor
+from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy.card import new_card
+from wbc_baselines.learned.policy.estimators import Batch, Estimator, make_estimator
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.policy.networks import Actor
 from wbc_bench.episodes.protocol import find_protocol
 
 
@@ -28,7 +29,7 @@ def networks(method: str, seed: int = 0) -> tuple[Actor, Estimator]:
 def write(folder: Path, method: str, seed: int = 0) -> Path:
     """A checkpoint METHOD@SEED in a folder."""
     path = folder / f"{method}@{seed}.safetensors"
-    card = checkpoint.new_card(method, seed, 1000, 1.5, find_protocol("smoke_v1")[0])
+    card = new_card(method, seed, 1000, 1.5, find_protocol("smoke_v1")[0])
     checkpoint.save(path, *networks(method, seed), card)
     return path
 

@@ -6,14 +6,14 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from wbc_baselines.learned.arm_ik import (  # noqa: E402
+from wbc_baselines.learned.training.arm_ik import (
     MARGIN,
     ArmKinematics,
     cross_matrix,
     rotation_about,
     rotation_vector,
 )
-from wbc_bench.robot import NUM_LEG_JOINTS, load_robot  # noqa: E402
+from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 ROBOT = load_robot()
 ARM = ArmKinematics(ROBOT)

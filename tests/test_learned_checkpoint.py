@@ -11,9 +11,9 @@ import torch
 from learned import networks, write
 from safetensors.torch import load_file, save_file
 
-from wbc_baselines.learned import checkpoint
-from wbc_baselines.learned.checkpoint import CheckpointError
-from wbc_baselines.learned.methods import METHODS
+from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy.card import FORMAT, CheckpointError, check_fit, read_card
+from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.errors import BenchError, UnknownNameError
 from wbc_bench.registry import load_controller, spec_of_replicate
@@ -41,7 +41,7 @@ def edit(path: Path, **fields) -> None:
 def replace_weights(path: Path, tensors: dict[str, torch.Tensor]) -> None:
     """Other weights under a card that vouches for them."""
     save_file(tensors, path)
-    card = checkpoint.read_card(path)
+    card = read_card(path)
     digest = checkpoint.hashlib.sha256(path.read_bytes()).hexdigest()
     path.with_suffix(".json").write_bytes(msgspec.json.encode(msgspec.structs.replace(card, sha256=digest)))
 
@@ -91,7 +91,7 @@ def test_the_card_writes_the_robot_out(sound):
     assert card["robot"]["default_q"] == robot.default_q.tolist()
     assert card["robot"]["ee_xyz"] == [0.235, 0.0, 0.0] and card["robot"]["control_period"] == 0.02
     assert card["protocol_digest"] == find_protocol("smoke_v1")[0].digest
-    assert card["dimensions"]["context"] == 19 and card["format"] == checkpoint.FORMAT
+    assert card["dimensions"]["context"] == 19 and card["format"] == FORMAT
 
 
 def test_missing_files(path, tmp_path):
@@ -192,12 +192,12 @@ def test_posture_joints_and_bodies_are_compared(sound):
     facts = msgspec.structs.replace(robot.facts, links=tuple(heavier))
     with pytest.raises(CheckpointError, match=r"bodies \(masses, inertias or geometry\)"):
         checkpoint.load(sound, dataclasses.replace(robot, facts=facts))
-    card = checkpoint.read_card(sound)
+    card = read_card(sound)
     swapped = msgspec.structs.replace(card.robot, joints=(*card.robot.joints[1::-1], *card.robot.joints[2:]))
     with pytest.raises(
         CheckpointError, match=r"joints\[0\]: trained hip_L_Joint, here abad_L_Joint and 1 more"
     ):
-        checkpoint.check_fit(msgspec.structs.replace(card, robot=swapped), robot, None, "x")
+        check_fit(msgspec.structs.replace(card, robot=swapped), robot, None, "x")
 
 
 def test_a_remark_on_a_source_is_no_other_robot(sound):

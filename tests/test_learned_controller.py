@@ -12,10 +12,11 @@ from conftest import CalmRows
 from learned import networks, write
 from tiny_protocol import write_tiny
 
-from wbc_baselines.learned import checkpoint, inputs
-from wbc_baselines.learned.controller import LearnedController
-from wbc_baselines.learned.methods import METHODS
-from wbc_baselines.learned.policy import Policy
+from wbc_baselines.learned.policy import checkpoint, inputs
+from wbc_baselines.learned.policy.card import new_card, other_conditions
+from wbc_baselines.learned.policy.controller import LearnedController
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.cli.main import main
 from wbc_bench.controller import DEPLOYABLE, Observation, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
@@ -49,7 +50,7 @@ class Recording:
 
 
 def make(method: str, engine=None) -> LearnedController:
-    card = checkpoint.new_card(method, 0, 0, 0.0, find_protocol("smoke_v1")[0])
+    card = new_card(method, 0, 0, 0.0, find_protocol("smoke_v1")[0])
     return LearnedController(
         load_robot(), card, engine or Policy(*networks(method)), f"learned:{method}@0", ""
     )
@@ -270,26 +271,26 @@ def test_a_real_episode(smoke: EvalProtocol, tmp_path, calm_rows: CalmRows):
 
 def test_conditions_other_than_the_training_s_are_listed():
     protocol, _ = find_protocol("ablation_v1")
-    card = checkpoint.new_card("no_latent", 0, 0, 0.0, protocol)
+    card = new_card("no_latent", 0, 0, 0.0, protocol)
     controller = LearnedController(load_robot(), card, Policy(*networks("no_latent")), "mine", "")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         controller.prepare(protocol)
     with pytest.warns(UserWarning, match=r"^mine .*: push\.speed: trained 0\.5, here 0\.0$"):
         controller.prepare(find_protocol("nopush_v1")[0])
-    told = checkpoint.other_conditions(card, find_protocol("reach_v1")[0])
+    told = other_conditions(card, find_protocol("reach_v1")[0])
     assert told == "push.speed: trained 0.5, here 0.0; targets.type: trained workspace, here reach"
 
 
 def test_the_physics_step_and_the_seed_are_no_conditions():
     protocol, _ = find_protocol("ablation_v1")
-    card = checkpoint.new_card("no_latent", 0, 0, 0.0, protocol)
+    card = new_card("no_latent", 0, 0, 0.0, protocol)
     physics = msgspec.structs.replace(protocol.physics, timestep=0.01, decimation=2)
     episodes = msgspec.structs.replace(protocol.episodes, seed=1, per_replicate=7)
     other = msgspec.structs.replace(protocol, physics=physics, episodes=episodes, name="mine")
-    assert checkpoint.other_conditions(card, other) == ""
+    assert other_conditions(card, other) == ""
     longer = msgspec.structs.replace(protocol, episodes=msgspec.structs.replace(episodes, horizon=20.0))
-    assert checkpoint.other_conditions(card, longer) == "episodes.horizon: trained 10.0, here 20.0"
+    assert other_conditions(card, longer) == "episodes.horizon: trained 10.0, here 20.0"
 
 
 @pytest.mark.parametrize(("method", "columns"), [("transformer_gru", 64), ("cenet", 16)])

@@ -10,15 +10,15 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from torch import Tensor  # noqa: E402
+from torch import Tensor
 
-from wbc_baselines.learned import inputs  # noqa: E402
-from wbc_baselines.learned.backends.base import Start  # noqa: E402
-from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
-from wbc_baselines.learned.environment import Environment, noise_half_widths, rotation_from_wxyz  # noqa: E402
-from wbc_baselines.learned.pool import POOLS, TargetPool, digest, draw_pool, read_pool, write_pool  # noqa: E402
-from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
-from wbc_baselines.learned.starts import (  # noqa: E402
+from wbc_baselines.learned.policy import inputs
+from wbc_baselines.learned.training.backends.base import Start
+from wbc_baselines.learned.training.backends.cpu import CpuBackend
+from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.environment import Environment, noise_half_widths, rotation_from_wxyz
+from wbc_baselines.learned.training.make import training_protocol
+from wbc_baselines.learned.training.resets import (
     DECAY,
     FIRST_SHARES,
     draw_pushes,
@@ -26,17 +26,24 @@ from wbc_baselines.learned.starts import (  # noqa: E402
     shares,
     weakened,
 )
-from wbc_baselines.learned.training import training_protocol  # noqa: E402
-from wbc_bench.episodes import randomization  # noqa: E402
-from wbc_bench.episodes.manifest import EpisodeManifest  # noqa: E402
-from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol  # noqa: E402
-from wbc_bench.errors import ManifestError  # noqa: E402
-from wbc_bench.evaluation.observation import Sensors  # noqa: E402
-from wbc_bench.evaluation.simulation import Simulation  # noqa: E402
-from wbc_bench.outcomes import STRATA  # noqa: E402
-from wbc_bench.randomness import stream  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
-from wbc_bench.rotations import matrix_from_wxyz  # noqa: E402
+from wbc_baselines.learned.training.target_set import (
+    POOLS,
+    TargetPool,
+    digest,
+    draw_pool,
+    read_pool,
+    write_pool,
+)
+from wbc_bench.episodes import randomization
+from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Noise, find_protocol
+from wbc_bench.errors import ManifestError
+from wbc_bench.evaluation.observation import Sensors
+from wbc_bench.evaluation.simulation import Simulation
+from wbc_bench.outcomes import STRATA
+from wbc_bench.randomness import stream
+from wbc_bench.robot import load_robot
+from wbc_bench.rotations import matrix_from_wxyz
 
 PROTOCOL = find_protocol("ablation_v1")[0]
 POOL = read_pool(PROTOCOL)

@@ -6,16 +6,16 @@ from learned import batch
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 
-from wbc_baselines.learned.estimators import ESTIMATORS, make_estimator
-from wbc_baselines.learned.estimators.latent import (
+from wbc_baselines.learned.policy.estimators import ESTIMATORS, make_estimator
+from wbc_baselines.learned.policy.estimators.latent import (
     KL_WEIGHT,
     LatentEstimator,
     kl_to_standard,
     masked_mean,
     split,
 )
-from wbc_baselines.learned.estimators.memory import Memory
-from wbc_baselines.learned.estimators.window import Layer, WindowEncoder, sinusoids
+from wbc_baselines.learned.policy.estimators.memory import Memory
+from wbc_baselines.learned.policy.estimators.window import Layer, WindowEncoder, sinusoids
 
 LATENT = ("cenet", "gru", "transformer", "transformer_gru")
 

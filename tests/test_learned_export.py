@@ -8,9 +8,9 @@ import pytest
 import torch
 from learned import networks, write
 
-from wbc_baselines.learned.export import OnnxEngine
-from wbc_baselines.learned.methods import METHODS
-from wbc_baselines.learned.policy import Policy
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.policy.onnx_engine import OnnxEngine
+from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.cli.main import main
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError

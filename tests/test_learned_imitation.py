@@ -7,31 +7,25 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
-from learned import write  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
-from test_learned_environment import POOL  # noqa: E402
-from test_learned_training import trainer  # noqa: E402
+from learned import write
+from tensordict import TensorDict
+from test_learned_environment import POOL
+from test_learned_training import trainer
 
-from wbc_baselines.learned import checkpoint, imitation  # noqa: E402
-from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
-from wbc_baselines.learned.cli import main  # noqa: E402
-from wbc_baselines.learned.estimators import make_estimator  # noqa: E402
-from wbc_baselines.learned.imitation import (  # noqa: E402
-    INPUTS,
-    Lessons,
-    Pupil,
-    begin_with,
-    draw_rows,
-    fit,
-    record,
-)
-from wbc_baselines.learned.inputs import VELOCITY  # noqa: E402
-from wbc_baselines.learned.networks import Actor  # noqa: E402
-from wbc_baselines.learned.symmetry import input_mirror  # noqa: E402
-from wbc_bench.controller import ControllerInfo, JointCommand  # noqa: E402
-from wbc_bench.episodes.protocol import find_protocol  # noqa: E402
-from wbc_bench.evaluation.control_loop import ControlLoop  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy.card import CheckpointError, new_card
+from wbc_baselines.learned.policy.estimators import make_estimator
+from wbc_baselines.learned.policy.inputs import VELOCITY
+from wbc_baselines.learned.policy.networks import Actor
+from wbc_baselines.learned.training import dagger as imitation
+from wbc_baselines.learned.training.cli import main
+from wbc_baselines.learned.training.dagger import Lessons, Pupil, draw_rows, fit, record
+from wbc_baselines.learned.training.symmetry import input_mirror
+from wbc_baselines.learned.training.warm_start import INPUTS, begin_with
+from wbc_bench.controller import ControllerInfo, JointCommand
+from wbc_bench.episodes.protocol import find_protocol
+from wbc_bench.evaluation.control_loop import ControlLoop
+from wbc_bench.robot import load_robot
 
 JOINTS, ACTION = slice(6, 20), slice(34, 48)  # of the observation: positions; the action of the step before
 TARGET_Y = 59
@@ -58,7 +52,7 @@ def start_at(path, seed: int = 0) -> Actor:
     actor = Actor(0)
     actor.normalizer.mean.normal_()
     actor.normalizer.std.uniform_(0.5, 2.0)
-    card = checkpoint.new_card("no_latent", 0, 0, 0.0, find_protocol("ablation_v1")[0])
+    card = new_card("no_latent", 0, 0, 0.0, find_protocol("ablation_v1")[0])
     checkpoint.save(path, actor, make_estimator("none"), card)
     return actor.eval()
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from wbc_baselines.learned import inputs, reference
-from wbc_baselines.learned.normalizer import FLOOR, Normalizer
+from wbc_baselines.learned.policy import inputs, reference
+from wbc_baselines.learned.policy.normalizer import FLOOR, Normalizer
 from wbc_bench.cli.main import main
 from wbc_bench.rotations import geodesic_angle, matrix_from_rotvec, rho6
 

@@ -6,16 +6,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from torch import Tensor  # noqa: E402
+from torch import Tensor
 
-from wbc_baselines.learned import rewards as r  # noqa: E402
-from wbc_baselines.learned.methods import Reward  # noqa: E402
-from wbc_baselines.learned.pool import read_pool  # noqa: E402
-from wbc_baselines.learned.reference import gate  # noqa: E402
-from wbc_baselines.learned.starts import DECAY  # noqa: E402
-from wbc_bench.episodes.protocol import find_protocol  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
-from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz  # noqa: E402
+from wbc_baselines.learned.policy.methods import Reward
+from wbc_baselines.learned.policy.reference import gate
+from wbc_baselines.learned.training import rewards as r
+from wbc_baselines.learned.training.resets import DECAY
+from wbc_baselines.learned.training.target_set import read_pool
+from wbc_bench.episodes.protocol import find_protocol
+from wbc_bench.robot import load_robot
+from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
 
 PERIOD = 0.02
 BODY = r.Body(

@@ -6,13 +6,13 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from test_learned_environment import coarse  # noqa: E402
+from test_learned_environment import coarse
 
-from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
-from wbc_baselines.learned.environment import Environment  # noqa: E402
-from wbc_baselines.learned.pool import TargetPool  # noqa: E402
-from wbc_baselines.learned.symmetry import critic_mirror, input_mirror, joint_mirror  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_baselines.learned.training.backends.cpu import CpuBackend
+from wbc_baselines.learned.training.environment import Environment
+from wbc_baselines.learned.training.symmetry import critic_mirror, input_mirror, joint_mirror
+from wbc_baselines.learned.training.target_set import TargetPool
+from wbc_bench.robot import load_robot
 
 ROBOT = load_robot()
 M = np.diag([1.0, -1.0, 1.0])

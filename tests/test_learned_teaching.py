@@ -6,15 +6,15 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
-from learned import write  # noqa: E402
-from test_learned_training import STEPS, TINY, assert_equal, trainer  # noqa: E402
+from learned import write
+from test_learned_training import STEPS, TINY, assert_equal, trainer
 
-from wbc_baselines.learned import checkpoint, runs, teaching  # noqa: E402
-from wbc_baselines.learned.checkpoint import CheckpointError  # noqa: E402
-from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS  # noqa: E402
-from wbc_baselines.learned.runs import RunFolder  # noqa: E402
-from wbc_baselines.learned.settings import TrainingError  # noqa: E402
-from wbc_baselines.learned.teaching import (  # noqa: E402
+from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy.card import CheckpointError
+from wbc_baselines.learned.training import distillation as teaching
+from wbc_baselines.learned.training import run_folder as runs
+from wbc_baselines.learned.training.config import TrainingError
+from wbc_baselines.learned.training.distillation import (
     ARRIVES,
     BLEND,
     SETS_OUT,
@@ -23,8 +23,10 @@ from wbc_baselines.learned.teaching import (  # noqa: E402
     Fit,
     Teaching,
 )
-from wbc_baselines.learned.training import Trainer  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS
+from wbc_baselines.learned.training.run_folder import RunFolder
+from wbc_baselines.learned.training.trainer import Trainer
+from wbc_bench.robot import load_robot
 
 REFERENCE = 57  # column of d_ref
 ROBOT = load_robot()

@@ -15,32 +15,34 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
 
-from mujoco.batch import Batch  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
-from test_learned_environment import POOL, manifest_of  # noqa: E402
+from mujoco.batch import Batch
+from tensordict import TensorDict
+from test_learned_environment import POOL, manifest_of
 
-from wbc_baselines.learned import checkpoint, runs  # noqa: E402
-from wbc_baselines.learned.backends import cpu  # noqa: E402
-from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
-from wbc_baselines.learned.campaign import campaign, is_done, runs_of, standing  # noqa: E402
-from wbc_baselines.learned.cli import main  # noqa: E402
-from wbc_baselines.learned.curves import measured_scores, smooth, write_curves  # noqa: E402
-from wbc_baselines.learned.environment import PRIVILEGED_COLUMNS, Environment  # noqa: E402
-from wbc_baselines.learned.estimators.latent import LatentEstimator  # noqa: E402
-from wbc_baselines.learned.inputs import History  # noqa: E402
-from wbc_baselines.learned.methods import METHODS  # noqa: E402
-from wbc_baselines.learned.runs import RunFolder, run  # noqa: E402
-from wbc_baselines.learned.settings import Settings, TrainingError  # noqa: E402
-from wbc_baselines.learned.speed import measure  # noqa: E402
-from wbc_baselines.learned.starts import draw_starts  # noqa: E402
-from wbc_baselines.learned.training import Trainer, advantages, make_environment  # noqa: E402
-from wbc_bench.episodes.protocol import Noise, Push, find_protocol  # noqa: E402
-from wbc_bench.errors import UnknownNameError  # noqa: E402
-from wbc_bench.evaluation import simulation  # noqa: E402
-from wbc_bench.evaluation.rollout import rollout  # noqa: E402
-from wbc_bench.randomness import stream  # noqa: E402
-from wbc_bench.registry import load_controller  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy.estimators.latent import LatentEstimator
+from wbc_baselines.learned.policy.inputs import History
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.training import run_folder as runs
+from wbc_baselines.learned.training.backends import cpu
+from wbc_baselines.learned.training.backends.cpu import CpuBackend
+from wbc_baselines.learned.training.campaign import campaign, is_done, runs_of, standing
+from wbc_baselines.learned.training.cli import main
+from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.curves import measured_scores, smooth, write_curves
+from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment
+from wbc_baselines.learned.training.make import make_environment
+from wbc_baselines.learned.training.resets import draw_starts
+from wbc_baselines.learned.training.run_folder import RunFolder, run
+from wbc_baselines.learned.training.throughput import measure
+from wbc_baselines.learned.training.trainer import Trainer, advantages
+from wbc_bench.episodes.protocol import Noise, Push, find_protocol
+from wbc_bench.errors import UnknownNameError
+from wbc_bench.evaluation import simulation
+from wbc_bench.evaluation.rollout import rollout
+from wbc_bench.randomness import stream
+from wbc_bench.registry import load_controller
+from wbc_bench.robot import load_robot
 
 TINY = Settings(
     "no_latent",
@@ -334,7 +336,7 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     rows = folder.read_metrics()
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
     assert [row["samples"] for row in rows] == [48, 96, 144, 192]
-    from wbc_baselines.learned.rewards import SCALES
+    from wbc_baselines.learned.training.rewards import SCALES
 
     assert {f"reward/{name}" for name in SCALES} <= rows[0].keys()
     assert any((folder.path / "tensorboard").iterdir())
@@ -353,8 +355,8 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
 def test_a_killed_run_resumes(tmp_path):
     """SIGKILL at any moment leaves a folder that the same command finishes."""
     code = (
-        "import sys; from pathlib import Path; from wbc_baselines.learned import runs;"
-        "from wbc_baselines.learned.settings import Settings; runs.CHECKPOINT_PERIOD = 0.0;"
+        "import sys; from pathlib import Path; from wbc_baselines.learned.training import run_folder as runs;"
+        "from wbc_baselines.learned.training.config import Settings; runs.CHECKPOINT_PERIOD = 0.0;"
         f"runs.run(Settings(**{asdict(replace(TINY, budget=1e9))}), runs.RunFolder(Path(sys.argv[1])),"
         "tensorboard=False)"
     )

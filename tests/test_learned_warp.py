@@ -6,14 +6,14 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mujoco_warp")
 
-from wbc_baselines.learned.backends.base import Start  # noqa: E402
-from wbc_baselines.learned.backends.cpu import CpuBackend  # noqa: E402
-from wbc_baselines.learned.backends.warp import WarpBackend  # noqa: E402
-from wbc_baselines.learned.pool import read_pool  # noqa: E402
-from wbc_baselines.learned.starts import draw_starts  # noqa: E402
-from wbc_bench.episodes.protocol import find_protocol  # noqa: E402
-from wbc_bench.randomness import stream  # noqa: E402
-from wbc_bench.robot import load_robot  # noqa: E402
+from wbc_baselines.learned.training.backends.base import Start
+from wbc_baselines.learned.training.backends.cpu import CpuBackend
+from wbc_baselines.learned.training.backends.warp import WarpBackend
+from wbc_baselines.learned.training.resets import draw_starts
+from wbc_baselines.learned.training.target_set import read_pool
+from wbc_bench.episodes.protocol import find_protocol
+from wbc_bench.randomness import stream
+from wbc_bench.robot import load_robot
 
 PROTOCOL = find_protocol("ablation_v1")[0]
 

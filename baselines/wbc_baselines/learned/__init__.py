@@ -13,7 +13,7 @@ class Learned:
 
     def __call__(self, robot: Robot, variant: str = "") -> Controller:
         """The controller of a checkpoint. Raises: CheckpointError, UnknownNameError."""
-        from wbc_baselines.learned.controller import from_checkpoint
+        from wbc_baselines.learned.policy.controller import from_checkpoint
 
         return from_checkpoint(robot, variant)
 
@@ -25,7 +25,7 @@ class Learned:
 
 def make_onnx(robot: Robot, variant: str = "") -> Controller:
     """The controller of an exported file, `onnx:FILE`. Raises: CheckpointError."""
-    from wbc_baselines.learned.export import from_onnx
+    from wbc_baselines.learned.policy.controller import from_onnx
 
     return from_onnx(robot, variant)
 

@@ -1,0 +1,251 @@
+"""The card of a checkpoint: what a policy is, where it comes from, and the robot that it was trained for.
+
+Everything on the card is checked when a checkpoint is loaded: transfers fail in silence where joint order,
+gains, limits, default posture or end-effector frame of the robot are not those of the training.
+"""
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from wbc_baselines.learned.policy import inputs
+from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_bench import provenance
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.errors import BenchError, UnknownNameError
+from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of
+
+FORMAT = 2
+Numbers = tuple[float, ...]
+
+
+class CheckpointError(BenchError):
+    """A checkpoint that is missing, damaged, or not for this robot or protocol."""
+
+
+class RobotFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What of robot and protocol a policy depends on; per joint in `joints` order."""
+
+    joints: tuple[str, ...]
+    default_q: Numbers  # [rad]
+    action_scale: Numbers  # [rad]
+    kp: Numbers  # [N m/rad]
+    kd: Numbers  # [N m s/rad]
+    effort: Numbers  # [N m]
+    lower: Numbers  # [rad]
+    upper: Numbers  # [rad]
+    velocity: Numbers  # [rad/s]
+    mount: str
+    mount_xyz: Numbers  # [m] arm base in the base frame
+    ee_link: str
+    ee_xyz: Numbers  # [m] tool centre point in the frame of its link
+    control_period: float  # [s]
+    bodies: str  # SHA-256 over masses, inertias, geometry and joint frames
+
+
+class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Columns of inputs and outputs."""
+
+    observation: int
+    command: int
+    history: int  # control steps
+    history_term: int
+    context: int
+    state: int
+    actions: int
+
+
+class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a checkpoint is and where it comes from."""
+
+    format: int
+    method: str
+    seed: int
+    samples: int  # control steps of training
+    wall_time: float  # [s] of training
+    machine: dict[str, str | int | float]
+    protocol: str
+    protocol_digest: str
+    conditions: dict[str, Any]  # of `protocol`, `section.field` by value
+    robot_digest: str  # SHA-256 over `robot`
+    robot: RobotFacts
+    git_commit: str | None
+    git_dirty: bool
+    dimensions: Dimensions
+    start: str = ""  # name and SHA-256 of the checkpoint that it began with
+    teacher: str = ""  # and of the one that it imitated at first
+    sha256: str = ""  # of the safetensors file
+
+
+def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
+    """The facts of a robot that is commanded every `control_period` [s]."""
+    facts, tcp = robot.facts, tcp_of(robot.facts, robot.config)
+    mount = mount_of(facts, robot.config)
+    bodies = [facts.base, facts.fixed, facts.foot, facts.links, facts.joints, mount.lumps]
+    built = msgspec.json.encode(_unsourced(msgspec.to_builtins(bodies)), order="deterministic")
+    return RobotFacts(
+        joints=JOINT_NAMES,
+        **{
+            name: tuple(getattr(robot, name).tolist())
+            for name in ("default_q", "action_scale", "kp", "kd", "effort", "lower", "upper", "velocity")
+        },
+        mount=robot.config.mount or facts.default_mount,
+        mount_xyz=mount.xyz,
+        ee_link=tcp.link,
+        ee_xyz=tcp.xyz,
+        control_period=control_period,
+        bodies=hashlib.sha256(built).hexdigest(),
+    )
+
+
+def conditions(protocol: EvalProtocol) -> dict[str, Any]:
+    """What episodes of a protocol are like: `section.field` by value, as JSON holds it.
+
+    Left out is what no policy meets (names, counts, seed, the rule of success), what `RobotFacts` holds, and
+    the physics step, which is longer in training than in any evaluation.
+    """
+    sections = msgspec.to_builtins(protocol)
+    for name in ("name", "description", "success", "robot", "physics"):
+        del sections[name]
+    sections["episodes"] = {"horizon": sections["episodes"]["horizon"]}
+    found = {}
+    for section, value in sections.items():
+        if isinstance(value, dict):
+            found |= {f"{section}.{field}": item for field, item in value.items()}
+        else:
+            found[section] = value
+    return msgspec.json.decode(msgspec.json.encode(found))
+
+
+def other_conditions(card: Card, protocol: EvalProtocol) -> str:
+    """`field: trained X, here Y` of every condition of a protocol that differs from the training's."""
+    trained, here, lines = card.conditions, conditions(protocol), []
+    names, kind = trained.keys() | here.keys(), "targets.type"
+    if trained.get(kind) != here[kind]:  # then the other fields of targets have nothing in common
+        names = {name for name in names if name == kind or not name.startswith("targets.")}
+    for name in sorted(names):
+        then, now = trained.get(name, "not set"), here.get(name, "not set")
+        if then != now:
+            lines.append(f"{name}: trained {_short(then)}, here {_short(now)}")
+    return "; ".join(lines)
+
+
+def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> Card:
+    """The card of a policy trained here, by this code: control steps and wall time [s] it took."""
+    facts = robot_facts(load_robot(protocol.robot), protocol.control_period)
+    commit, dirty = provenance.commit()
+    return Card(
+        format=FORMAT,
+        method=method,
+        seed=seed,
+        samples=samples,
+        wall_time=wall_time,
+        machine=provenance.machine(),
+        protocol=protocol.name,
+        protocol_digest=protocol.digest,
+        conditions=conditions(protocol),
+        robot_digest=_digest(facts),
+        robot=facts,
+        git_commit=commit,
+        git_dirty=dirty,
+        dimensions=_dimensions(make_estimator(METHODS[method].estimator)),
+    )
+
+
+def read_card(path: Path) -> Card:
+    """The card beside a safetensors file, itself whole and of a method and dimensions that exist here.
+
+    Raises: CheckpointError, UnknownNameError.
+    """
+    beside = card_path(path)
+    for file in (path, beside):
+        if not file.is_file():
+            raise CheckpointError(f"checkpoint '{path}': there is no file '{file}'")
+    return decode_card(beside.read_bytes(), str(beside))
+
+
+def decode_card(text: bytes, where: str) -> Card:
+    """The card of a JSON text. Raises: CheckpointError, UnknownNameError."""
+    try:
+        version = msgspec.json.decode(text, type=_Version).format
+        if version != FORMAT:
+            raise CheckpointError(f"checkpoint card '{where}' has format {version}, valid: {FORMAT}")
+        card = msgspec.json.decode(text, type=Card)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise CheckpointError(f"checkpoint card '{where}' cannot be read: {error}") from error
+    if card.method not in METHODS:
+        raise UnknownNameError("method", card.method, METHODS, where)
+    here = _dimensions(make_estimator(METHODS[card.method].estimator))
+    if differences := _differences(card.dimensions, here):
+        raise CheckpointError(f"checkpoint card '{where}' has other dimensions: {differences}")
+    if card.robot_digest != _digest(card.robot):
+        raise CheckpointError(f"checkpoint card '{where}' was altered: its robot does not match its digest")
+    return card
+
+
+def check_fit(card: Card, robot: Robot | None, control_period: float | None, where: str) -> None:
+    """Raises: CheckpointError with every field in which robot or control period [s] differ from training."""
+    period = card.robot.control_period if control_period is None else control_period
+    here = robot_facts(robot, period) if robot else msgspec.structs.replace(card.robot, control_period=period)
+    if differences := _differences(card.robot, here):
+        raise CheckpointError(f"checkpoint '{where}' was trained on another robot: {differences}")
+
+
+def card_path(path: Path) -> Path:
+    """Where the card of a safetensors file stands: beside it."""
+    return path.with_suffix(".json")
+
+
+class _Version(msgspec.Struct):
+    format: int
+
+
+def _dimensions(estimator: Estimator) -> Dimensions:
+    return Dimensions(
+        observation=inputs.OBSERVATION,
+        command=inputs.COMMAND,
+        history=inputs.HISTORY,
+        history_term=inputs.HISTORY_TERM,
+        context=estimator.context_dim,
+        state=estimator.state_dim,
+        actions=inputs.ACTIONS,
+    )
+
+
+def _differences(trained: msgspec.Struct, here: msgspec.Struct) -> str:
+    """`name: trained X, here Y` of every field that differs; of a tuple, its first entry that does."""
+    lines = []
+    for name in trained.__struct_fields__:
+        then, now = getattr(trained, name), getattr(here, name)
+        if then == now:
+            continue
+        if isinstance(then, tuple) and len(then) == len(now):
+            k = next(k for k, pair in enumerate(zip(then, now, strict=True)) if pair[0] != pair[1])
+            others = sum(a != b for a, b in zip(then, now, strict=True)) - 1
+            more = f" and {others} more" if others else ""
+            lines.append(f"{name}[{k}]: trained {then[k]}, here {now[k]}{more}")
+        elif name == "bodies":
+            lines.append(f"bodies (masses, inertias or geometry): trained {then[:12]}, here {now[:12]}")
+        else:
+            lines.append(f"{name}: trained {then}, here {now}")
+    return "; ".join(lines)
+
+
+def _short(value: Any) -> str:
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()
+
+
+def _digest(facts: RobotFacts) -> str:
+    return hashlib.sha256(msgspec.json.encode(facts)).hexdigest()
+
+
+def _unsourced(value):
+    """Without the remarks on where a fact comes from."""
+    if isinstance(value, dict):
+        return {key: _unsourced(item) for key, item in value.items() if key != "src"}
+    if isinstance(value, list | tuple):
+        return [_unsourced(item) for item in value]
+    return value

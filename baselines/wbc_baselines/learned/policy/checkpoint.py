@@ -1,0 +1,155 @@
+"""Checkpoints: weights and normalisers as safetensors, and a card (`card`) beside them."""
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as tensors_of
+from safetensors.torch import save as bytes_of
+
+from wbc_baselines.learned.policy import inputs
+from wbc_baselines.learned.policy.card import Card, CheckpointError, card_path, check_fit, read_card
+from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.policy.networks import Actor
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.errors import UnknownNameError
+from wbc_bench.files import write_atomic
+from wbc_bench.robot import Robot, load_robot
+
+CHECKPOINTS = Path(__file__).parents[1] / "checkpoints"  # METHOD@SEED.safetensors and .json
+
+
+class Checkpoint(NamedTuple):
+    """A loaded checkpoint."""
+
+    card: Card
+    actor: Actor
+    estimator: Estimator
+
+
+def save(path: Path, actor: Actor, estimator: Estimator, card: Card) -> None:
+    """Write PATH.safetensors and its card; a card never stands beside weights that are not its own."""
+    tensors = {f"actor.{name}": value for name, value in actor.state_dict().items()}
+    tensors |= {f"estimator.{name}": value for name, value in estimator.state_dict().items()}
+    data = bytes_of({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
+    card = msgspec.structs.replace(card, sha256=hashlib.sha256(data).hexdigest())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomic(path, data)
+    text = msgspec.json.format(msgspec.json.encode(card), indent=2)
+    write_atomic(card_path(path), text + b"\n")
+
+
+def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None = None) -> Checkpoint:
+    """The checkpoint of a file, fit for a robot and a protocol where they are given.
+
+    Protocols may differ in targets, noise, randomisation, pushes and physics step: a policy is evaluated
+    under many. Robot and control period must be those of the training.
+
+    Raises:
+        CheckpointError: missing, truncated or altered file, other dimensions, robot or control period.
+        UnknownNameError: a method that does not exist.
+    """
+    card = read_card(path)
+    data = path.read_bytes()
+    found = hashlib.sha256(data).hexdigest()
+    if found != card.sha256:
+        raise CheckpointError(
+            f"checkpoint '{path}' is truncated or altered: SHA-256 {found[:12]} of {len(data)} bytes, "
+            f"its card says {card.sha256[:12]}"
+        )
+    if protocol is not None:
+        robot = load_robot(protocol.robot)
+    check_fit(card, robot, protocol.control_period if protocol else None, str(path))
+    estimator = make_estimator(METHODS[card.method].estimator)
+    actor = Actor(estimator.context_dim)
+    try:
+        tensors = tensors_of(data)
+    except SafetensorError as error:
+        raise CheckpointError(f"checkpoint '{path}' is not a safetensors file: {error}") from error
+    _fill(path, {"actor": actor, "estimator": estimator}, tensors)
+    return Checkpoint(card, actor.eval(), estimator.eval())
+
+
+def identity(name: str) -> str:
+    """Name and SHA-256 of a checkpoint's weights, for the card of one that comes from it; "" of no name."""
+    return f"{find(name).stem} {read_card(find(name)).sha256}" if name else ""
+
+
+def load_start(name: str, estimator: str) -> Checkpoint:
+    """A checkpoint that a method with this estimator can begin with; see `shared_context`.
+
+    Raises: CheckpointError, its estimator is a third one; and see `load`.
+    """
+    found = load(find(name))
+    theirs = METHODS[found.card.method]
+    if theirs.estimates and theirs.estimator != estimator:
+        raise CheckpointError(
+            f"--start '{name}' is of {found.card.method}, valid: a method without a context, the oracle, "
+            f"or a method with the estimator '{estimator}'"
+        )
+    return found
+
+
+def shared_context(start: Estimator, mine: Estimator) -> int:
+    """First columns of the context that mean the same in two policies: all, or the velocity, or none."""
+    if type(start) is type(mine):
+        return mine.context_dim
+    return inputs.VELOCITY if start.context_dim and mine.trainable else 0
+
+
+def load_teacher(name: str) -> Checkpoint:
+    """A checkpoint whose answer to a state does not depend on those before it.
+
+    Raises: CheckpointError, its context is estimated; and see `load`.
+    """
+    found = load(find(name))
+    if found.estimator.trainable:
+        raise CheckpointError(
+            f"--teacher '{name}' is of {found.card.method}, valid: a method without an estimated context"
+        )
+    return found
+
+
+def find(name: str) -> Path:
+    """The file of `METHOD@SEED` among the checkpoints of this package, or of `PATH.safetensors`.
+
+    Raises: UnknownNameError, no such checkpoint (with the nearest names).
+    """
+    if name.endswith(".safetensors"):
+        return Path(name)
+    path = CHECKPOINTS / f"{name}.safetensors"
+    if not path.is_file():
+        known = available()
+        method = name.partition("@")[0]
+        if method not in METHODS:
+            raise UnknownNameError("checkpoint", name, known or METHODS, "METHOD@SEED or PATH.safetensors")
+        raise UnknownNameError("checkpoint", name, known, f"{METHODS[method].label}: none trained or shipped")
+    return path
+
+
+def available() -> list[str]:
+    """Names METHOD@SEED of the checkpoints of this package."""
+    return sorted(path.stem for path in CHECKPOINTS.glob("*@*.safetensors"))
+
+
+def _fill(path: Path, modules: dict[str, torch.nn.Module], tensors: dict[str, torch.Tensor]) -> None:
+    """Put tensors into modules; names and shapes must match, one to one."""
+    wanted = {f"{part}.{name}": v for part, m in modules.items() for name, v in m.state_dict().items()}
+
+    def refuse(problem: str, names: Iterable[str]) -> None:
+        if names := sorted(names):
+            raise CheckpointError(
+                f"checkpoint '{path}': {problem} {', '.join(names[:3])} ({len(names)} in all)"
+            )
+
+    refuse("it lacks", wanted.keys() - tensors.keys())
+    refuse("it has tensors that the method does not know,", tensors.keys() - wanted.keys())
+    refuse("wrong shape of", [name for name, v in wanted.items() if v.shape != tensors[name].shape])
+    refuse("not a number in", [name for name, v in tensors.items() if not v.isfinite().all()])
+    for name, value in wanted.items():
+        value.copy_(tensors[name])

@@ -1,0 +1,54 @@
+"""Policies as ONNX files: window and recurrent state are explicit inputs and outputs, normalisers are inside.
+
+The checkpoint's card travels in the file, so that `onnx:FILE` is checked against the robot like a checkpoint.
+"""
+
+import tempfile
+import warnings
+from pathlib import Path
+
+import msgspec
+import onnx
+import torch
+from torch import Tensor, nn
+
+from wbc_baselines.learned.policy.card import Card
+from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, _output
+from wbc_baselines.learned.policy.policy import Policy
+from wbc_bench.files import write_atomic
+
+
+class _Positional(nn.Module):
+    """A policy whose inputs and outputs are in the order of its flow, as the exporter wants them."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, *values: Tensor) -> tuple[Tensor, ...]:
+        flow = self.policy.flow
+        found = self.policy(dict(zip(flow.inputs, values, strict=True)))
+        return tuple(found[name] for name in flow.outputs)
+
+
+def write_onnx(path: Path, policy: Policy, card: Card) -> None:
+    """Write a policy and its card; the batch is free."""
+    flow = policy.flow
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        # of torch's two exporters the one that traces is deprecated, and needs no further package
+        warnings.simplefilter("ignore", DeprecationWarning)
+        raw = Path(folder) / "policy.onnx"
+        torch.onnx.export(
+            _Positional(policy).eval(),
+            tuple(torch.zeros(2, *shape) for shape in flow.inputs.values()),
+            str(raw),
+            input_names=list(flow.inputs),
+            # an output cannot be called as an input is
+            output_names=[_output(name) for name in flow.outputs],
+            dynamic_axes={name: {0: "batch"} for name in (*flow.inputs, *map(_output, flow.outputs))},
+            opset_version=OPSET,
+            dynamo=False,
+        )
+        model = onnx.load(raw)
+    onnx.helper.set_model_props(model, {CARD: msgspec.json.encode(card).decode()})
+    write_atomic(path, model.SerializeToString(deterministic=True))

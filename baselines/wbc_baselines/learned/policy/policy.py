@@ -1,0 +1,63 @@
+"""A trained method as one function: observation, window and state in, action and next of both out."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from wbc_baselines.learned.policy.estimators import Estimator
+from wbc_baselines.learned.policy.inputs import (
+    COMMAND,
+    HISTORY,
+    HISTORY_TERM,
+    OBSERVATION,
+    PRIVILEGED,
+    VELOCITY,
+)
+from wbc_baselines.learned.policy.networks import Actor
+
+
+class Flow(NamedTuple):
+    """Names and widths of what goes into a policy and comes out of it; the batch is the first axis."""
+
+    inputs: dict[str, tuple[int, ...]]
+    outputs: tuple[str, ...]  # `window` and `state` are the next step's inputs
+
+
+class Policy(nn.Module):
+    """Actor and estimator, deterministic: latent mean, action mean."""
+
+    def __init__(self, actor: Actor, estimator: Estimator) -> None:
+        super().__init__()
+        self.actor, self.estimator = actor, estimator
+        self.flow = flow_of(estimator)
+
+    def forward(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
+        """One control step of N robots; names and widths are those of `flow`, and maybe the `latent`."""
+        parts, found = [values["observation"], values["command"]], {}
+        if "privileged" in values:
+            parts.append(values["privileged"])
+        elif "window" in values:
+            found["window"] = torch.cat([values["window"][:, 1:], values["term"][:, None]], dim=1)
+            state = values.get("state", values["term"][:, :0])
+            context, state = self.estimator.step(found["window"], state)
+            parts.append(context)
+            found["latent"] = context[:, VELOCITY:]
+            if "state" in values:
+                found["state"] = state
+        return {"action": self.actor(torch.cat(parts, dim=-1))} | found
+
+
+def flow_of(estimator: Estimator) -> Flow:
+    """What a policy with this estimator reads and writes."""
+    inputs: dict[str, tuple[int, ...]] = {"observation": (OBSERVATION,), "command": (COMMAND,)}
+    outputs = ["action"]
+    if estimator.trainable:
+        inputs |= {"term": (HISTORY_TERM,), "window": (HISTORY, HISTORY_TERM)}
+        outputs.append("window")
+        if estimator.state_dim:
+            inputs["state"] = (estimator.state_dim,)
+            outputs.append("state")
+    elif estimator.context_dim:
+        inputs["privileged"] = (PRIVILEGED,)
+    return Flow(inputs, tuple(outputs))

@@ -1,0 +1,100 @@
+"""MuJoCo's batch API: the C engine of the evaluation, on a few threads."""
+
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wbc_baselines.learned.training.backends.base import Start, State, columns_of, state_of
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.evaluation.simulation import FATAL_WARNINGS, places_of
+from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+
+_STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
+_STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
+_MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
+
+
+class CpuBackend:
+    """N simulations on `threads` threads; the result does not depend on how many."""
+
+    def __init__(self, protocol: EvalProtocol, num_envs: int, threads: int) -> None:
+        self.num_envs, self.device = num_envs, torch.device("cpu")
+        self._robot = robot = load_robot(protocol.robot)
+        self._model = model = robot.model(protocol.physics.timestep)
+        self._decimation = protocol.physics.decimation
+        self._batch = batch = Batch(model, num_envs, nthread=threads, persistent=True)
+        self._state = {name: batch.bind(name) for name in _STATE}
+        self._fields = {name: batch.expand(name) for name in _MODEL}
+        outputs = {name: batch.bind(name) for name in ("site_xpos", "site_xmat", "sensordata")}
+        self._out = outputs | {"actuator_force": batch.bind("actuator_force")}
+        self._columns = columns_of(places_of(model), self.device)
+        self._base = model.body(robot.facts.base).id
+
+    def reset(self, ids: Tensor, start: Start) -> State:
+        rows: NDArray[np.int64] = ids.numpy()
+        drawn = SimpleNamespace(**{name: column.numpy() for name, column in start._asdict().items()})
+        self._randomise(rows, drawn)
+        self._batch.reset(rows, stage=_STAGE_NONE)
+        default = self._robot.default_q
+        qpos, qvel = np.zeros((len(rows), 21)), np.zeros((len(rows), 20))
+        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = drawn.base_height, 1.0, default
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += drawn.leg_q
+        qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = drawn.base_vel, drawn.leg_qd
+        self._state["qpos"][rows], self._state["qvel"][rows] = qpos, qvel
+        self._state["ctrl"][rows] = default
+        self._batch.forward(rows)
+        return self._read(rows)
+
+    def _randomise(self, ids: NDArray[np.int64], start: SimpleNamespace) -> None:
+        """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
+        model, fields, base = self._model, self._fields, self._base
+        # the larger coefficient of a pair counts, so both sides carry the draw
+        fields["geom_friction"][ids, :, 0] = start.friction[:, None]
+        mass = model.body_mass[base] + start.base_mass
+        fields["body_mass"][ids, base] = mass
+        fields["body_inertia"][ids, base] = model.body_inertia[base] * (mass / model.body_mass[base])[:, None]
+        fields["actuator_gainprm"][ids, :, 0] = model.actuator_gainprm[:, 0] * start.kp_scale
+        fields["actuator_biasprm"][ids, :, 1] = model.actuator_biasprm[:, 1] * start.kp_scale
+        fields["actuator_biasprm"][ids, :, 2] = model.actuator_biasprm[:, 2] * start.kd_scale
+        self._batch.set_const(ids)
+
+    def push(self, velocity_w: Tensor) -> None:
+        self._state["qvel"][:, :2] += velocity_w.numpy()
+
+    def step(self, command: Tensor) -> State:
+        self._state["ctrl"][:] = command.numpy()
+        self._batch.step(nstep=self._decimation, stage=_STAGE_VEL)
+        return self._read(slice(None))
+
+    def _read(self, ids: NDArray[np.int64] | slice) -> State:
+        def take(array: NDArray[np.float64]) -> Tensor:
+            return torch.from_numpy(array[ids].astype(np.float32))
+
+        qpos, qvel = take(self._state["qpos"]), take(self._state["qvel"])
+        pos, rot = take(self._out["site_xpos"]), take(self._out["site_xmat"]).unflatten(-1, (3, 3))
+        sensor = take(self._out["sensordata"])
+        state = state_of(self._columns, qpos, qvel, take(self._out["actuator_force"]), pos, rot, sensor)
+        fatal = torch.from_numpy((self._batch.warning[ids][:, FATAL_WARNINGS, 1] > 0).any(1))
+        return state._replace(diverged=state.diverged | fatal)
+
+    def check(self) -> None:
+        pass  # the engine's warnings are read at every step
+
+    def save(self) -> dict[str, NDArray]:
+        return {name: array.copy() for name, array in (self._state | self._fields).items()}
+
+    def load(self, saved: dict[str, NDArray]) -> None:
+        for name, array in self._fields.items():
+            array[:] = saved[name]
+        self._batch.set_const()
+        self._batch.reset(stage=_STAGE_NONE)
+        for name, array in self._state.items():
+            array[:] = saved[name]
+        self._batch.forward(stage=_STAGE_VEL)
+        # forward leaves the solver's warm start as the reset found it
+        self._state["qacc_warmstart"][:] = saved["qacc_warmstart"]

@@ -1,0 +1,86 @@
+"""Learning curves of runs, as figures in the style of the bench."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.training.run_folder import RunFolder
+from wbc_bench.results.figures.style import DASHES, METHOD_COLOURS, STYLE, save
+
+Rows = list[dict]
+SMOOTHING = 0.03  # of the samples: width of the moving mean
+PANELS = (  # metric, axis label, factor
+    ("episode/return", "Return of an episode", 1.0),
+    ("episode/success", "Success in training (%)", 100.0),
+    ("episode/falls", "Falls in training (%)", 100.0),
+    ("episode/pos_error", "Position error at 10 s (cm)", 100.0),
+)
+
+
+def smooth(rows: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
+    """Samples and the moving mean of a metric, weighted by the episodes that ended."""
+    chosen = [row for row in rows if row.get(metric) is not None]
+    x = np.array([row["samples"] for row in chosen], dtype=float)
+    y = np.array([row[metric] for row in chosen], dtype=float)
+    weight = np.array([max(row["episode/count"], 1e-9) for row in chosen], dtype=float)
+    if len(x) == 0:
+        return x, y
+    half = SMOOTHING * x[-1] / 2
+    low, high = np.searchsorted(x, x - half), np.searchsorted(x, x + half, side="right")
+    sums = np.concatenate([[0.0], np.cumsum(weight * y)])
+    weights = np.concatenate([[0.0], np.cumsum(weight)])
+    return x, (sums[high] - sums[low]) / (weights[high] - weights[low])
+
+
+def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, factor: float) -> Axes:
+    """One metric over millions of control steps; a colour a method, a dash a seed."""
+    methods = list(dict.fromkeys(name.split("@")[0] for name, _ in runs))
+    for name, rows in runs:
+        method, _, seed = name.partition("@")
+        x, y = smooth(rows, metric)
+        first = all(not n.startswith(f"{method}@") for n, _ in runs[: [n for n, _ in runs].index(name)])
+        ax.plot(
+            x / 1e6,
+            factor * y,
+            color=METHOD_COLOURS[methods.index(method) % len(METHOD_COLOURS)],
+            linestyle=DASHES[int(seed or 0) % len(DASHES)],
+            label=METHODS[method].label if first else None,
+        )
+    ax.set(xlabel="Control steps (million)", ylabel=label)
+    ax.set_ylim(bottom=0, top=102 if label.endswith("(%)") else None)
+    return ax
+
+
+def measured_scores(rows: Rows, part: float = 0.1) -> tuple[float, float, float]:
+    """PHASE, SCORE_M and SCORE_L of `rewards`, measured over the last `part` of a run's iterations."""
+    last = rows[-max(1, round(part * len(rows))) :]
+
+    def mean(gate: str) -> float:
+        return float(np.mean([row[f"gate/{gate}"] for row in last]))
+
+    phase = mean("phase")
+    return phase, mean("manipulation") / (1 - phase), mean("reference") / phase
+
+
+def write_curves(out: Path, figures: Path, name: str = "learning_curves") -> list[Path]:
+    """Draw every run below `out` into `figures`, PNG and SVG; nothing if there is no run."""
+    order = list(METHODS)
+    folders = sorted(
+        (path.parent for path in out.glob("*@*/metrics.jsonl")),
+        key=lambda p: (order.index(p.name.split("@")[0]), p.name),
+    )
+    runs = [(folder.name, RunFolder(folder).read_metrics()) for folder in folders]
+    if not runs:
+        return []
+    with style.context(["default", str(STYLE)]):
+        figure = Figure(figsize=(7.6, 5.6))
+        axes = figure.subplots(2, 2)
+        for ax, panel in zip(axes.flat, PANELS, strict=True):
+            curve(ax, runs, *panel)
+        figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        return save(figure, name, figures)

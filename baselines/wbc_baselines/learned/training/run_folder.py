@@ -1,0 +1,283 @@
+"""The folder of a run: settings, metrics, resume state, final checkpoint. Every write is whole or absent."""
+
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_bench.files import write_atomic
+
+if TYPE_CHECKING:
+    from wbc_baselines.learned.training.trainer import Trainer
+
+CHECKPOINT_PERIOD = 90.0  # [s] between resume files: what a kill can cost
+STALE = 900.0  # [s] without a sign of life after which a claim may be taken over
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Files of one run under `path`."""
+
+    path: Path
+
+    @property
+    def settings(self) -> Path:
+        return self.path / "settings.json"
+
+    @property
+    def metrics(self) -> Path:
+        """One JSON object an iteration; a line after a resume replaces all from its iteration on."""
+        return self.path / "metrics.jsonl"
+
+    @property
+    def changes(self) -> Path:
+        """One JSON object a change: control steps so far, and each changed setting before and after."""
+        return self.path / "changes.jsonl"
+
+    @property
+    def resume(self) -> Path:
+        return self.path / "resume.pt"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What an evaluation reads, `learned:PATH`; as old as the resume file."""
+        return self.path / f"{self.path.name}.safetensors"
+
+    @property
+    def claim(self) -> Path:
+        return self.path / "claim"
+
+    @property
+    def finished(self) -> Path:
+        """Written last, when budget and final checkpoint are there."""
+        return self.path / "finished.json"
+
+    def open(self, settings: Settings, change: bool = False) -> None:
+        """Make the folder, or check that it belongs to these settings; with `change`, note what is new.
+
+        Raises:
+            TrainingError: it holds a run with other settings; they are listed.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        if self.settings.exists():
+            changed = settings.changes(json.loads(self.settings.read_text()))
+            fixed = ("method", "seed", "protocol")  # what the run is called and judged by
+            wrong = {n: c for n, c in changed.items() if not change or n in fixed}
+            if wrong:
+                told = ", ".join(f"{name} {old} -> {new}" for name, (old, new) in wrong.items())
+                raise TrainingError(
+                    f"run '{self.path}' was started with other settings: {told}; "
+                    "valid: the same, another --out, or --change"
+                    + (f", but for {', '.join(fixed)}" if change else "")
+                )
+            if changed:
+                rows = self.read_metrics()
+                row = {"samples": rows[-1]["samples"] if rows else 0, "changed": changed}
+                _append(self.changes, row)
+        write_atomic(self.settings, json.dumps(asdict(settings), indent=2).encode())
+
+    def read_metrics(self) -> list[dict]:
+        """Metrics by iteration; a line that a kill has cut short is left out."""
+        if not self.metrics.exists():
+            return []
+        rows: list[dict] = []
+        for line in self.metrics.read_text().splitlines():
+            try:
+                row = json.loads(line)
+            except json.JSONDecodeError:
+                continue
+            while rows and rows[-1]["iteration"] >= row["iteration"]:
+                rows.pop()  # lost in a kill, and trained again
+            rows.append(row)
+        return rows
+
+    def append(self, row: dict) -> None:
+        """Add one iteration's metrics."""
+        _append(self.metrics, row)
+
+    def take(self) -> bool:
+        """Claim the run for this process; False if another, living one has it."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            with self.claim.open("x") as file:
+                file.write(_me())
+            return True
+        except FileExistsError:
+            pass
+        try:
+            idle = time.time() - self.claim.stat().st_mtime
+        except FileNotFoundError:
+            return self.take()
+        if idle < STALE and not self._is_dead():
+            return False
+        # of several that want it, the one whose rename succeeds gets it
+        old = self.claim.with_name(f"claim.old.{socket.gethostname()}.{os.getpid()}")
+        try:
+            self.claim.rename(old)
+        except FileNotFoundError:
+            return False
+        old.unlink()
+        return self.take()
+
+    def _is_dead(self) -> bool:
+        """Whether the claim is of a process of this machine that has ended."""
+        host, _, pid = self.claim.read_text().partition(" ")
+        return host == socket.gethostname() and pid.isdigit() and not Path(f"/proc/{pid}").exists()
+
+    def touch(self) -> None:
+        """A sign of life."""
+        self.claim.touch()
+
+    def release(self) -> None:
+        """Give the claim back."""
+        self.claim.unlink(missing_ok=True)
+
+
+def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
+    """Write checkpoint and resume file; `seconds` of training so far."""
+    import io
+
+    import torch
+
+    trainer.write_checkpoint(folder.checkpoint, seconds)
+    buffer = io.BytesIO()
+    torch.save(trainer.save() | {"seconds": seconds}, buffer)
+    write_atomic(folder.resume, buffer.getvalue())
+
+
+def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
+    """Continue from the resume file, if there is one; seconds of training before.
+
+    Raises:
+        TrainingError: the file cannot be read, or another version of the code wrote it.
+    """
+    import pickle
+    import zipfile
+
+    import torch
+
+    if not folder.resume.exists():
+        return 0.0
+    try:
+        saved = torch.load(folder.resume, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        raise TrainingError(f"resume file '{folder.resume}' cannot be read: {error}") from error
+    try:
+        trainer.load(saved)
+    except (KeyError, TypeError) as error:  # a field too few or too many
+        raise TrainingError(
+            f"resume file '{folder.resume}' is of another version of the code ({error}); valid: the version "
+            "that wrote it, or another --out with --start at the run's checkpoint"
+        ) from error
+    return saved["seconds"]
+
+
+def run(
+    settings: Settings,
+    folder: RunFolder,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    tensorboard: bool = True,
+    change: bool = False,
+) -> None:
+    """Train from wherever the folder stands to the budget, and write the final checkpoint.
+
+    With `change`, a run that was started with other settings goes on with these, in new episodes.
+
+    Raises:
+        TrainingError: see `RunFolder.open`, `load_resume`, `Trainer.iterate`; or another process has the run.
+    """
+    from wbc_baselines.learned.training.make import make_environment
+    from wbc_baselines.learned.training.trainer import Trainer, duration
+
+    settings.check()
+    if not folder.take():
+        raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
+    try:
+        folder.open(settings, change)
+        trainer = Trainer(settings, make_environment(settings))
+        before = load_resume(trainer, folder)
+        if not trainer.done:
+            folder.finished.unlink(missing_ok=True)  # at a smaller budget
+        started, first = time.monotonic() - before, trainer.samples
+        saved = time.monotonic()
+        writer = _writer(folder, trainer.iteration) if tensorboard else None
+        per_iteration = settings.envs * settings.steps
+        with _stop_requests() as stop:
+            while not trainer.done:
+                metrics = trainer.iterate()
+                seconds = time.monotonic() - started
+                rate = per_iteration / duration(metrics)
+                row = {"iteration": trainer.iteration, "samples": trainer.samples, "seconds": seconds}
+                folder.append(row | {k: None if v != v else float(v) for k, v in metrics.items()})
+                if writer:
+                    for name, value in metrics.items():
+                        writer.add_scalar(name, value, trainer.samples)
+                progress(trainer.samples - first, int(settings.budget) - first, line(trainer, metrics, rate))
+                if stop or trainer.done or time.monotonic() - saved > CHECKPOINT_PERIOD:
+                    save_resume(trainer, folder, seconds)
+                    saved = time.monotonic()
+                    folder.touch()
+                if stop:
+                    raise KeyboardInterrupt
+        note = {"samples": trainer.samples, "seconds": time.monotonic() - started}
+        write_atomic(folder.finished, json.dumps(note).encode())
+        if writer:
+            writer.close()
+    finally:
+        folder.release()
+
+
+@contextmanager
+def _stop_requests() -> Iterator[list[int]]:
+    """A list that fills when the process is asked to stop, so that it can save; a second ask is obeyed."""
+    asked: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def line(trainer: "Trainer", metrics: dict[str, float], rate: float) -> str:
+    """How training stands, for a progress line."""
+    share = {name: metrics[f"episode/{name}"] for name in ("success", "falls")}
+    return (
+        f"{trainer.settings.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
+        f"return {metrics['episode/return']:.1f}, success {share['success']:.1%}, falls {share['falls']:.1%}"
+    )
+
+
+def _writer(folder: RunFolder, iteration: int):
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder.path / "tensorboard"), purge_step=iteration or None)
+
+
+def _append(path: Path, row: dict) -> None:
+    with path.open("a+b") as file:
+        if file.tell() and not _ends_with_newline(file):
+            file.write(b"\n")  # the line before was cut short
+        file.write(json.dumps(row).encode() + b"\n")
+
+
+def _ends_with_newline(file) -> bool:
+    file.seek(-1, os.SEEK_END)
+    return file.read(1) == b"\n"
+
+
+def _me() -> str:
+    return f"{socket.gethostname()} {os.getpid()}"

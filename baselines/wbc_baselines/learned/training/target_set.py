@@ -1,0 +1,125 @@
+"""The targets that training draws from: feasible ones of the evaluation's own generator, made once and kept.
+
+A target takes some 40 ms to find (a `step` target 100 ms), a training run needs one every few hundred
+microseconds. So a pool is drawn once, from streams of which no evaluation shares a key, and episodes pick
+from it.
+"""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
+from wbc_bench.episodes.workspace_targets import draw_workspace_target
+from wbc_bench.errors import ManifestError, ProtocolError
+from wbc_bench.outcomes import STRATA
+
+SEED_OFFSET = 2**62  # added to the protocol's seed: no evaluation draws from such a key
+POOLS = Path(__file__).parents[1] / "pools"  # ships with the package
+CHUNK = 30  # targets a task: about a second of work
+
+Progress = Callable[[int, int], None]  # (done, total)
+
+
+class TargetPool(NamedTuple):
+    """M feasible targets."""
+
+    stratum: NDArray[np.int8]  # (M,) index into STRATA
+    pos_w: NDArray[np.float32]  # (M, 3) [m]
+    quat_w: NDArray[np.float32]  # (M, 4) wxyz
+    witness_qpos: NDArray[np.float32]  # (M, 21) a posture that reaches it: base [m], wxyz, joints [rad]
+
+    def __len__(self) -> int:
+        return len(self.stratum)
+
+
+def digest(protocol: EvalProtocol) -> str:
+    """SHA-256 of what of a protocol a target depends on: the box, the robot, the limits, the seed."""
+    parts = [protocol.targets, protocol.robot, protocol.termination, protocol.episodes.seed]
+    return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()
+
+
+def draw_pool(
+    protocol: EvalProtocol, count: int, workers: int = 1, progress: Progress = lambda done, total: None
+) -> TargetPool:
+    """`count` targets, the strata in turn; the same for any number of workers.
+
+    Raises:
+        ProtocolError: the protocol has no workspace targets, or a stratum cannot be filled.
+    """
+    if not isinstance(protocol.targets, WorkspaceTargets):
+        raise ProtocolError(f"protocol {protocol.name}: targets of type reach, valid for training: workspace")
+    seed = protocol.episodes.seed + SEED_OFFSET
+    shifted = msgspec.structs.replace(
+        protocol, episodes=msgspec.structs.replace(protocol.episodes, seed=seed)
+    )
+
+    def work(start: int) -> list[tuple]:
+        draws = [draw_workspace_target(shifted, 0, k) for k in range(start, min(start + CHUNK, count))]
+        return [(STRATA.index(d.stratum), d.pos_w, d.quat_w, d.witness_qpos) for d in draws]
+
+    rows: list[tuple] = []
+    parts: Any = Parallel(n_jobs=workers, return_as="generator")(
+        delayed(work)(start) for start in range(0, count, CHUNK)
+    )
+    for part in parts:
+        rows.extend(part)
+        progress(len(rows), count)
+    stratum, *poses = zip(*rows, strict=True)
+    return TargetPool(np.array(stratum, np.int8), *(np.array(pose, np.float32) for pose in poses))
+
+
+def write_pool(pool: TargetPool, protocol: EvalProtocol, path: Path) -> None:
+    """Write a pool with the digest of what it was drawn for, at once or not at all."""
+    columns = [pa.array(pool.stratum)]
+    for values in pool[1:]:
+        columns.append(pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1]))
+    table = pa.Table.from_arrays(columns, names=list(TargetPool._fields))
+    table = table.replace_schema_metadata({"protocol": protocol.name, "digest": digest(protocol)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fresh = path.with_name(f".{path.name}.part")
+    pq.write_table(table, fresh, compression="zstd", use_dictionary=False)
+    fresh.replace(path)
+
+
+def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
+    """The pool of a protocol, by default the one that ships.
+
+    Raises:
+        ManifestError: missing, unreadable, or drawn for other targets, another robot or other limits.
+    """
+    path = path or POOLS / f"{protocol.name}.parquet"
+    if not path.exists():
+        raise ManifestError(
+            f"target pool '{path}' does not exist: make it with "
+            f"`wbc-train targets --protocol {protocol.name}`"
+        )
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise ManifestError(f"target pool '{path}' is not readable parquet: {error}") from error
+    made_for = (table.schema.metadata or {}).get(b"digest", b"").decode()
+    if table.column_names != list(TargetPool._fields):
+        raise ManifestError(
+            f"target pool '{path}' has columns {', '.join(table.column_names)}, valid: "
+            f"{', '.join(TargetPool._fields)}: draw it again with `wbc-train targets`"
+        )
+    if made_for != digest(protocol):
+        raise ManifestError(
+            f"target pool '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
+            f"{protocol.name} has {digest(protocol)[:16]}...: draw it again with `wbc-train targets`"
+        )
+
+    def matrix(name: str) -> NDArray[np.float32]:
+        column = table[name].combine_chunks()
+        return column.flatten().to_numpy().reshape(len(table), -1)
+
+    return TargetPool(table["stratum"].to_numpy(), *map(matrix, TargetPool._fields[1:]))

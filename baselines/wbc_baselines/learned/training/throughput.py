@@ -1,0 +1,110 @@
+"""What training and evaluation take beside the physics that they need, measured side by side in one run."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from statistics import median
+from typing import NamedTuple
+
+import mujoco.batch
+
+from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.training.config import Settings
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
+from wbc_bench.evaluation import simulation
+from wbc_bench.evaluation.shard import evaluate_shard
+
+ROUNDS = 5  # the first is warm-up; methods take turns, so that all meet the same machine
+EPISODES = 50  # of an evaluation, as many as in a shard
+
+
+class Speed(NamedTuple):
+    """One method on this machine: medians over the rounds."""
+
+    method: str
+    steps: float  # control steps/s of training
+    physics: float  # control steps/s of the engine alone, in the same states
+    training: float  # the engine's share of training's time: the first over the second
+    evaluation: float | None  # the engine's share of an evaluation's time, one thread; None without a policy
+
+
+class EngineClock(mujoco.batch.Batch):
+    """MuJoCo's batch of simulations, which counts the time that its steps take."""
+
+    seconds = 0.0
+
+    def step(self, *arguments, **options):
+        begun = time.perf_counter()
+        found = super().step(*arguments, **options)
+        EngineClock.seconds += time.perf_counter() - begun
+        return found
+
+
+def measure(
+    settings: Settings, methods: Sequence[str], rounds: int = ROUNDS, episodes: int = EPISODES
+) -> list[Speed]:
+    """Train and evaluate the methods in turns, each from its policy that ships, or else from the oracle's.
+
+    Training is PPO without a teacher; lessons of geometry are in if they begin at 0 control steps.
+    """
+    import torch
+
+    from wbc_baselines.learned.training.make import make_environment
+    from wbc_baselines.learned.training.trainer import Trainer, duration
+
+    available = checkpoint.available()
+    ours = {m: name for m in methods if (name := f"{m}@{settings.seed}") in available}
+    protocol, path = find_protocol(settings.protocol)
+    rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, episodes)
+    control_steps = settings.envs * settings.steps
+    training: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
+    evaluation: dict[str, list[float]] = {method: [] for method in methods}
+    with _engine_clocks():
+        trainers = []
+        for method in methods:
+            chosen = replace(settings, method=method, start=ours.get(method, "oracle@0"), teacher="")
+            trainers.append(Trainer(chosen, make_environment(chosen)))
+        for _ in range(rounds):
+            for trainer in trainers:
+                before = EngineClock.seconds
+                whole = duration(trainer.iterate())
+                training[trainer.settings.method].append((whole, EngineClock.seconds - before))
+        torch.set_num_threads(1)
+        for _ in range(rounds):
+            for method, name in ours.items():
+                evaluation[method].append(_evaluation(f"learned:{name}", protocol, rows))
+        torch.set_num_threads(settings.threads)
+    return [
+        Speed(
+            method,
+            control_steps / median(whole for whole, _ in times[1:]),
+            control_steps / median(engine for _, engine in times[1:]),
+            median(engine / whole for whole, engine in times[1:]),
+            median(evaluation[method][1:]) if method in ours else None,
+        )
+        for method, times in training.items()
+    ]
+
+
+def _evaluation(spec: str, protocol: EvalProtocol, rows: EpisodeManifest) -> float:
+    """The engine's share of the time that these episodes take, as one shard."""
+    begun, before = time.perf_counter(), EngineClock.seconds
+    evaluate_shard(spec, protocol, rows)
+    return (EngineClock.seconds - before) / (time.perf_counter() - begun)
+
+
+@contextmanager
+def _engine_clocks() -> Iterator[None]:
+    """Have simulations of training and evaluation made from here on count their engine's time."""
+    from wbc_baselines.learned.training.backends import cpu
+
+    places = (cpu, simulation)
+    for place in places:
+        place.Batch = EngineClock
+    try:
+        yield
+    finally:
+        for place in places:
+            place.Batch = mujoco.batch.Batch
