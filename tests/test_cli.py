@@ -136,7 +136,7 @@ def test_no_traceback_and_exit_code_in_a_real_process(tmp_path):
     command = [sys.executable, "-m", "wbc_bench", "ablation", "--seeds", "0"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr.startswith("error: --seeds 0") and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: --replicates 0") and done.stderr.count("\n") == 1
     unknown = subprocess.run([*command[:3], "--sedes", "1"], capture_output=True, text=True, cwd=tmp_path)
     assert unknown.returncode == 2 and "Traceback" not in unknown.stderr
 
@@ -197,12 +197,13 @@ def test_a_failing_report_leaves_the_old_one(capsys, tiny, tmp_path, monkeypatch
     assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()} == before
 
 
-def test_a_second_size_is_refused(capsys, tiny, tmp_path):
+def test_a_run_grows_and_is_reused_by_less(capsys, tiny, tmp_path):
     evaluate(tiny, tmp_path / "out", "--episodes", 3)
     capsys.readouterr()
-    line = fails(capsys, "eval", "--controller", "hold", "--protocol", tiny, "--out", tmp_path / "out")
-    assert "requested is 3, asked for 6" in line and "--redo" in line
-    evaluate(tiny, tmp_path / "out", "--redo")
+    evaluate(tiny, tmp_path / "out")
+    assert "| 12/12 |" in capsys.readouterr().out
+    evaluate(tiny, tmp_path / "out", "--episodes", 3)
+    assert "6 episodes, of which 3 are asked for" in capsys.readouterr().err
 
 
 def test_ablation_runs_the_study(capsys, tmp_path):

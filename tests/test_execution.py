@@ -13,7 +13,7 @@ import pytest
 from tiny_protocol import write_tiny
 
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
-from wbc_bench.episodes.protocol import load_protocol
+from wbc_bench.episodes.protocol import read_protocol
 from wbc_bench.errors import ControllerError, StoreError, UnknownNameError
 from wbc_bench.evaluation import workers as workers_module
 from wbc_bench.evaluation.execution import Job, run_jobs
@@ -82,7 +82,7 @@ def tiny(tmp_path_factory) -> Path:
 
 
 def job(path: Path, spec: str, replicates: int = 1, episodes: int = EPISODES) -> Job:
-    protocol = load_protocol(path)
+    protocol = read_protocol(path)
     manifest, sha256 = read_manifest(protocol, manifest_path(path))
     return Job(protocol, manifest, sha256, spec, range(replicates), episodes)
 
@@ -121,7 +121,7 @@ def test_nothing_is_computed_twice(tiny, reference, tmp_path, monkeypatch, capsy
     run_jobs([job(tiny, spec)], ResultStore(tmp_path), Engine())
     monkeypatch.setattr(workers_module, "evaluate_shard", None)
     run_jobs([job(tiny, spec)], ResultStore(tmp_path), Engine())
-    assert "kept" in capsys.readouterr().err
+    assert "reused" in capsys.readouterr().err
 
 
 def test_a_killed_worker_costs_only_time(tiny, reference, tmp_path):
@@ -259,14 +259,14 @@ def test_changed_code_does_not_join_old_shards(tiny, tmp_path):
     write_controller(tmp_path, "edited", "q = q + 0.1")
     with pytest.raises(StoreError, match="software_sha256"):
         run_jobs([job(tiny, spec)], store, Engine())
-    run_jobs([job(tiny, spec)], store, Engine(), redo=True)
+    run_jobs([job(tiny, spec)], store, Engine(), overwrite=True)
     assert store.runs()[0].record.resumed_shards == 0
 
 
 def test_columns_of_the_record(tiny):
     from wbc_bench.results.metrics import METRICS
 
-    protocol = load_protocol(tiny)
+    protocol = read_protocol(tiny)
     manifest, _ = read_manifest(protocol, manifest_path(tiny))
     table = evaluate_shard("hold", protocol, manifest.take(slice(0, 3)))
     labels = ["replicate", "episode", "stratum", "condition", "orientation", "height", "target_x", "target_y"]

@@ -250,16 +250,18 @@ def test_one_seed_a_replicate(capsys, tmp_path, monkeypatch):
     assert "| Evaluated | learned:cenet | 12/12 |" in capsys.readouterr().out
 
 
-def test_the_study_says_which_seeds_are_missing(capsys, tmp_path, monkeypatch):
-    from wbc_bench.cli.evaluate import _loadable
+def test_the_study_says_which_seeds_are_missing(tmp_path, monkeypatch):
+    from wbc_bench.evaluation.evaluate import Asked, evaluate_all
+    from wbc_bench.evaluation.workers import Engine
+    from wbc_bench.results.store import ResultStore
 
     monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path)
     write(tmp_path, "gru", 1)
-    assert _loadable("learned:gru", range(3), load_robot(), optional=True) == [1]
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2 and all("not evaluated: learned:gru: unknown checkpoint 'gru@" in x for x in lines)
-    assert _loadable("learned:oracle", range(3), load_robot(), optional=True) == []
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    store, asked = ResultStore(tmp_path / "out"), Asked.of(str(write_tiny(tmp_path, replicates=3)))
+    found = evaluate_all(["learned:gru", "learned:oracle"], asked, store, Engine(), optional=True)
+    assert list(found) == ["learned:gru replicate 0, 2", "learned:oracle"]
+    assert "unknown checkpoint 'gru@0'" in found["learned:gru replicate 0, 2"]
+    assert [run.record.resolved_controller for run in store.runs()] == ["learned:gru@1"]
 
 
 def test_a_real_episode(smoke: EvalProtocol, tmp_path, calm_rows: CalmRows):

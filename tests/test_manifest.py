@@ -9,7 +9,7 @@ import pytest
 from wbc_bench.episodes.freeze import build_manifest, freeze
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest, write_manifest
-from wbc_bench.episodes.protocol import find_protocol, load_protocol, protocol_names
+from wbc_bench.episodes.protocol import find_protocol, protocol_names, read_protocol
 from wbc_bench.episodes.targets import BEYOND
 from wbc_bench.episodes.verify import verify
 from wbc_bench.errors import ManifestError, ProtocolError
@@ -97,7 +97,7 @@ def test_a_manifest_of_another_protocol_is_refused(frozen: Path, tmp_path: Path)
     file = tmp_path / "other.toml"
     file.write_text(SMOKE_FILE.read_text().replace("ee_pos = 0.01", "ee_pos = 0.02"))
     with pytest.raises(ManifestError, match="was made for protocol digest"):
-        read_manifest(load_protocol(file), frozen)
+        read_manifest(read_protocol(file), frozen)
     with pytest.raises(ManifestError, match="wbc-bench protocol freeze"):
         read_manifest(SMOKE, tmp_path / "none.parquet")
 
@@ -136,13 +136,13 @@ def test_a_stratum_that_the_box_does_not_hold_is_an_error(tmp_path: Path, monkey
     file.write_text(SMOKE_FILE.read_text().replace("x = [-0.8, 0.8]", "x = [7.0, 8.0]"))
     monkeypatch.setattr("wbc_bench.episodes.workspace_targets.MAX_ATTEMPTS", 50)
     with pytest.raises(ProtocolError, match=r"none of 50 poses .* 'arm' .* at `\$\.targets`"):
-        build_manifest(load_protocol(file))
+        build_manifest(read_protocol(file))
 
 
 def test_a_ladder_of_heights(tmp_path: Path) -> None:
     file = tmp_path / "ladder.toml"
     file.write_text(LITTLE_LADDER)
-    protocol = load_protocol(file)
+    protocol = read_protocol(file)
     freeze(protocol, manifest_path(file))
     manifest, _ = read_manifest(protocol, manifest_path(file))
     assert all(check.ok for check in verify(protocol, manifest_path(file)))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from wbc_bench.episodes.protocol import find_protocol, load_protocol, protocol_names
+from wbc_bench.episodes.protocol import find_protocol, protocol_names, read_protocol
 from wbc_bench.errors import ProtocolError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
 
@@ -58,7 +58,7 @@ def test_a_mistake_names_its_field(tmp_path: Path, old: str, new: str, message: 
     assert old in SMOKE
     path = written(tmp_path, SMOKE.replace(old, new, 1))
     with pytest.raises(ProtocolError) as caught:
-        load_protocol(path)
+        read_protocol(path)
     text = str(caught.value)
     assert re.search(message, text), text
     assert str(path) in text and "\n" not in text
@@ -78,7 +78,7 @@ def test_a_mistake_names_its_field(tmp_path: Path, old: str, new: str, message: 
 def test_a_mistake_in_a_ladder_names_its_field(tmp_path: Path, old: str, new: str, message: str) -> None:
     assert old in REACH
     with pytest.raises(ProtocolError) as caught:
-        load_protocol(written(tmp_path, REACH.replace(old, new, 1)))
+        read_protocol(written(tmp_path, REACH.replace(old, new, 1)))
     assert re.search(message, str(caught.value)), str(caught.value)
 
 
@@ -90,17 +90,17 @@ def test_unknown_protocol_is_told_the_nearest(tmp_path: Path) -> None:
 
 
 def test_digest_covers_meaning_not_layout(tmp_path: Path) -> None:
-    plain = load_protocol(PROTOCOLS / "smoke_v1.toml")
+    plain = read_protocol(PROTOCOLS / "smoke_v1.toml")
     assert (
-        load_protocol(written(tmp_path, "# why\n" + SMOKE.replace("0.5, 0.9", "0.50,  0.9"))).digest
+        read_protocol(written(tmp_path, "# why\n" + SMOKE.replace("0.5, 0.9", "0.50,  0.9"))).digest
         == plain.digest
     )
     described = SMOKE.replace("Twelve", "A dozen")
-    assert load_protocol(written(tmp_path, described)).digest == plain.digest
+    assert read_protocol(written(tmp_path, described)).digest == plain.digest
     spelled_out = SMOKE + "\n[physics]\ntimestep = 0.002\n"  # the default
-    assert load_protocol(written(tmp_path, spelled_out)).digest == plain.digest
+    assert read_protocol(written(tmp_path, spelled_out)).digest == plain.digest
     for old, new in (("seed = 7", "seed = 8"), ("0.5, 0.9", "0.5, 0.8"), ("smoke_v1", "smoke_v9")):
-        assert load_protocol(written(tmp_path, SMOKE.replace(old, new))).digest != plain.digest
+        assert read_protocol(written(tmp_path, SMOKE.replace(old, new))).digest != plain.digest
 
 
 def test_steps_and_windows() -> None:

@@ -127,7 +127,7 @@ def test_killed_between_record_and_clean_up(tmp_path):
     assert not (run.path / "shards").exists()
 
 
-@pytest.mark.parametrize("field", ["protocol_digest", "manifest_sha256", "controller", "requested"])
+@pytest.mark.parametrize("field", ["protocol_digest", "manifest_sha256", "controller"])
 @pytest.mark.parametrize("whole", [True, False])
 def test_another_question_is_refused(tmp_path, field, whole):
     if whole:
@@ -138,10 +138,10 @@ def test_another_question_is_refused(tmp_path, field, whole):
         writer.write(0, rows(range(3)), COST)
         writer.close()
     # "a-b" shares the folder of "a:b"
-    other = {"controller": "a-b", "requested": 6}.get(field, "x" * 64)
+    other = {"controller": "a-b"}.get(field, "x" * 64)
     with pytest.raises(StoreError, match=field):
         RunWriter(store, key(**{field: other}))
-    RunWriter(store, key(**{field: other}), redo=True).close()
+    RunWriter(store, key(**{field: other}), overwrite=True).close()
 
 
 def test_shards_of_other_software_are_refused_but_a_whole_run_is_kept(tmp_path):

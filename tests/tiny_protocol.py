@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, write_manifest
-from wbc_bench.episodes.protocol import MAX_PUSHES, load_protocol
+from wbc_bench.episodes.protocol import MAX_PUSHES, read_protocol
 
 TOML = """
 name = "tiny"
@@ -72,7 +72,7 @@ def write_tiny(folder: Path, replicates: int = 2, episodes: int = 6, horizon: fl
     path = folder / "tiny.toml"
     path.write_text(TOML.format(replicates=replicates, episodes=episodes, horizon=horizon))
     frozen = manifest_path(path)
-    write_manifest(manifest(replicates, episodes), load_protocol(path), frozen)
+    write_manifest(manifest(replicates, episodes), read_protocol(path), frozen)
     sha256 = hashlib.sha256(frozen.read_bytes()).hexdigest()
     frozen.with_suffix(".sha256").write_text(f"{sha256}  {frozen.name}\n")
     return path

@@ -21,6 +21,7 @@ class ControllerInfo(NamedTuple):
     signals: frozenset[Signal]
     control_period: float  # [s]
     source: str  # paper, package or file it comes from
+    files: tuple[Path, ...] = ()  # weights and the like: other contents make another controller
 
 
 class Proprioception(NamedTuple):

@@ -1,7 +1,9 @@
 """Errors a user can cause. Each is one line: the value, what is valid, and where it came from."""
 
 import difflib
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class BenchError(Exception):
@@ -40,3 +42,18 @@ class StoreError(BenchError):
 
 class SourceError(BenchError):
     """A source of targets that cannot be read or opened, or a target that is none."""
+
+
+def fault_of(error: BaseException) -> str:
+    """An exception of somebody else's code in one line, with the frames that lead to it.
+
+    Frames of the harness are left out: `KeyError: 'x' (mine.py:23 in act > helper.py:4 in scale)`.
+    """
+    frames = [
+        f"{Path(frame.filename).name}:{frame.lineno} in {frame.name}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not Path(frame.filename).is_relative_to(Path(__file__).parent)
+    ]
+    text = " ".join(str(error).split())
+    hint = "; a signal that `info.signals` does not declare is None" if "'NoneType' object" in text else ""
+    return f"{type(error).__name__}: {text}{hint}" + (f" ({' > '.join(frames[-4:])})" if frames else "")

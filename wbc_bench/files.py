@@ -1,6 +1,8 @@
 """Files and folders that are written: whole or not at all, under names that every system takes."""
 
 import contextlib
+import errno
+import hashlib
 import os
 from pathlib import Path
 
@@ -16,9 +18,20 @@ def _protocols() -> Path:
 PROTOCOLS = _protocols()  # released protocols, scripts and studies: a wheel holds them beside the code
 
 
+LONGEST_NAME = 120  # characters of a folder's name; file systems take 255 bytes, temporary names are longer
+
+
 def folder_name(name: str) -> str:
-    """A protocol or controller spec as a folder name."""
-    return "".join(c if c.isascii() and (c.isalnum() or c in "._@-") else "-" for c in name).strip("-.")
+    """A protocol or controller spec as a folder name; a long one is cut and ends in a part of its digest.
+
+    Raises: StoreError, nothing of the name can stand in a folder's.
+    """
+    plain = "".join(c if c.isascii() and (c.isalnum() or c in "._@-") else "-" for c in name).strip("-.")
+    if not plain:
+        raise StoreError(f"'{name}' cannot name a folder, valid: at least one ASCII letter or digit")
+    if len(plain) > LONGEST_NAME:
+        plain = f"{plain[:LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return plain
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -52,13 +65,18 @@ def ensure_writable(folder: Path) -> None:
     except OSError as error:
         raise StoreError(f"folder '{folder}' cannot be written: {error.strerror}") from error
     probe = folder / f".probe-{os.getpid()}"
-    write_atomic(probe, b"probe")
-    probe.unlink()
+    try:
+        write_atomic(probe, b"probe")
+    finally:
+        probe.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # network shares cannot sync a folder
+            raise
     finally:
         os.close(descriptor)

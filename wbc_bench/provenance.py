@@ -1,26 +1,27 @@
-"""Where a result comes from: commit, package versions, machine, and one digest over all code that made it."""
+"""Where a result comes from: commit, package versions, machine, and digests over the code that computed it.
 
+Which code counts follows from the imports of what computes an episode, so that a remark in a module that only
+draws changes nothing, and a change to a module that a controller imports from its own folder does.
+"""
+
+import ast
 import hashlib
-import inspect
 import os
 import platform
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from wbc_bench.errors import ControllerError
+
 PACKAGE = Path(__file__).parent
-SOURCE_SUFFIXES = (".py", ".toml")
-# Parts of the harness that no episode depends on: editing a table must not part a run from its shards.
-BYSTANDERS = frozenset(
-    {"protocols", "paper_values", "freeze", "cli", "__main__", "publish", "report", "tables", "plots"}
-    | {"markup", "analysis", "stats", "store", "progress", "provenance"}
-    | {"sources", "track", "tracking", "demo", "door_records", "records"}
-    | {"gallery", "workspace", "latents", "introspection", "viewer"}
-)
+ROOT = "wbc_bench.evaluation.shard"  # what computes an episode, with all that it imports
 
 
 class Commit(NamedTuple):
@@ -28,6 +29,18 @@ class Commit(NamedTuple):
 
     sha: str | None
     dirty: bool  # tracked or new files differ from the commit, results aside
+
+
+class Software(NamedTuple):
+    """Digests over all that the rows of a shard depend on besides the manifest; SHA-256 in hexadecimal."""
+
+    harness: str  # sources of the harness that an episode runs through, and versions of packages
+    controller: str  # sources of the controller, the files it declares, and its own digest
+
+    @property
+    def digest(self) -> str:
+        """Both in one: shards with the same digest were computed by the same code, committed or not."""
+        return hashlib.sha256(f"{self.harness} {self.controller}".encode()).hexdigest()
 
 
 def commit() -> Commit:
@@ -85,7 +98,7 @@ def facts(controller: object) -> dict[str, Any]:
     """What a record says of the code, packages, machine and time behind it."""
     now = commit()
     return {
-        "software_sha256": software_digest(controller),
+        "software_sha256": software(controller).digest,
         "git_commit": now.sha,
         "git_dirty": now.dirty,
         "versions": versions(),
@@ -94,34 +107,104 @@ def facts(controller: object) -> dict[str, Any]:
     }
 
 
-def software_digest(controller: object) -> str:
-    """SHA-256 over the sources that an episode depends on, its controller's too, and the package versions.
+def software(controller: object) -> Software:
+    """The digests of the code that evaluates a controller.
 
-    Two shards with the same digest were computed by the same code, committed or not.
+    A controller counts with every module that it imports from its own package or folder, at the top or
+    inside a function, with the files in `info.files`, with the controllers that are its attributes, and with
+    what its method `digest()` returns, for state that no file holds, e.g. an environment variable.
+
+    Raises: ControllerError, a declared file cannot be read.
     """
+    digest = hashlib.sha256(str(getattr(controller, "checkpoint_sha256", None)).encode())
+    for path in sources(type(controller).__module__):
+        _add(digest, path.name, path.read_bytes())
+    for path in map(Path, getattr(getattr(controller, "info", None), "files", ())):
+        try:
+            _add(digest, path.name, path.read_bytes())
+        except OSError as error:
+            raise ControllerError(
+                f"file '{path}', declared in `info.files`, cannot be read: {error.strerror}"
+            ) from error
+    for part in vars(controller).values() if hasattr(controller, "__dict__") else ():
+        if hasattr(part, "info") and hasattr(part, "act"):
+            _add(digest, "part", software(part).controller.encode())
+    own = getattr(controller, "digest", None)
+    if callable(own):
+        _add(digest, "digest()", str(own()).encode())
+    return Software(_harness(), digest.hexdigest())
+
+
+def _harness() -> str:
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
-    digest.update(str(getattr(controller, "checkpoint_sha256", None)).encode())
-    harness = (p for p in _sources(PACKAGE) if Path(p.relative_to(PACKAGE).parts[0]).stem not in BYSTANDERS)
-    for path in [*harness, *_sources(_home(controller))]:
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    for path in sources(ROOT):
+        _add(digest, path.relative_to(PACKAGE).as_posix(), path.read_bytes())
     return digest.hexdigest()
 
 
-def _home(controller: object) -> Path | None:
-    """The top folder of the package a controller comes from, or the one file when it is not in a package."""
-    module = sys.modules.get(type(controller).__module__.partition(".")[0])
-    file = getattr(module, "__file__", None)
+def _add(digest, name: str, data: bytes) -> None:
+    digest.update(name.encode() + b"\0" + str(len(data)).encode() + b"\0" + data)
+
+
+def sources(module: str) -> list[Path]:
+    """Files of a loaded module and of all that it imports from its own package, or from its own folder.
+
+    Facts (.toml) beside a module of a package belong to it. A module that was made interactively has no file.
+    """
+    top = module.partition(".")[0]
+    file = getattr(sys.modules.get(top), "__file__", None)
     if file is None:
-        try:
-            return Path(inspect.getfile(type(controller)))
-        except (TypeError, OSError):
-            return None  # built interactively: there is no source to read
-    return Path(file).parent if hasattr(module, "__path__") else Path(file)
-
-
-def _sources(home: Path | None) -> list[Path]:
-    if home is None:
         return []
-    if home.is_file():
-        return [home]
-    return sorted(path for path in home.rglob("*") if path.suffix in SOURCE_SUFFIXES and path.is_file())
+    first = Path(file).resolve()
+    packaged = first.name == "__init__.py"
+    home = first.parents[1 if packaged else 0]
+    if not packaged and home.name in ("site-packages", "dist-packages"):
+        return [first]  # its folder is everybody's
+    seen: set[Path] = set()
+    queue = [module]
+    while queue:
+        name = queue.pop()
+        if name.partition(".")[0] != top and (packaged or name.startswith("wbc_bench")):
+            continue  # another package; the harness has a digest of its own
+        for path in (_files_of(name, home) if name != "__main__" else {first}) - seen:
+            seen |= {path, *path.parent.glob("*.toml")} if packaged else {path}
+            queue += _imports(path, home)
+    return sorted(seen)
+
+
+def _files_of(module: str, home: Path) -> set[Path]:
+    """The file of a module below `home`, and those of the packages around it; empty if it is not there."""
+    *packages, _ = parts = module.split(".")
+    stem = home.joinpath(*parts)
+    found = {stem.with_suffix(".py"), stem / "__init__.py"}
+    found |= {home.joinpath(*packages[: k + 1]) / "__init__.py" for k in range(len(packages))}
+    return {path for path in found if path.is_file()}
+
+
+def _imports(path: Path, home: Path) -> Iterator[str]:
+    """Every module that a file may import; names taken from a package are tried as modules, too."""
+    package = [part for part in path.relative_to(home).parent.parts] if path.is_relative_to(home) else []
+    for module, level, name in _statements(path, path.stat().st_mtime_ns):
+        if level:
+            module = ".".join([*package[: len(package) - level + 1], *([module] if module else [])])
+        yield module
+        yield f"{module}.{name}"
+
+
+@cache
+def _statements(path: Path, changed: int) -> tuple[tuple[str, int, str], ...]:
+    """(module, level of a relative import, name) of the imports of a file, less those for type checkers."""
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (SyntaxError, ValueError):
+        return ()  # it counts by its bytes; importing it fails with a better message
+    skipped: set[ast.AST] = set()
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            skipped |= {inner for part in node.body for inner in ast.walk(part)}
+        elif node not in skipped and isinstance(node, ast.Import):
+            found += [(alias.name, 0, "") for alias in node.names]
+        elif node not in skipped and isinstance(node, ast.ImportFrom):
+            found += [(node.module or "", node.level, alias.name) for alias in node.names]
+    return tuple(found)

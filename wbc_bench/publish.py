@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.episodes.protocol import ReachTargets, load_protocol, protocol_names
+from wbc_bench.episodes.protocol import ReachTargets, protocol_names, read_protocol
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.results import report
@@ -92,7 +92,7 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
 
 
 def _write_protocol(name: str, methods: Mapping[str, Evaluated], out: Path, beside: Sequence[str]) -> None:
-    released = load_protocol(PROTOCOLS / f"{name}.toml") if name in protocol_names() else None
+    released = read_protocol(PROTOCOLS / f"{name}.toml") if name in protocol_names() else None
     if released and isinstance(released.targets, ReachTargets):
         write_reach_tables(name, methods, out / "tables")
         write_reach_figures(name, methods, out / "figures")

@@ -1,15 +1,19 @@
 """A controller by its name: an installed one, or a class in a module or file of the user."""
 
 import importlib
+import pickle
 import sys
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+from wbc_bench import provenance
 from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, PerReplicate
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
 from wbc_bench.robot import Robot
 
 ENTRY_POINTS = "wbc_bench.controllers"
+ControllerFactory = Callable[[Robot], Controller]
 
 
 def controllers() -> dict[str, EntryPoint]:
@@ -41,11 +45,48 @@ def load_controller(spec: str, robot: Robot) -> Controller:
         raise
     except ImportError as error:
         raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
+    return _checked(controller, spec)
+
+
+def build_controller(source: str | bytes, robot: Robot) -> Controller:
+    """The controller of a spec, or of what `pack_controller` made: an object, or what makes one of a robot.
+
+    Raises: ControllerError, UnknownNameError, see `load_controller`.
+    """
+    if isinstance(source, str):
+        return load_controller(source, robot)
+    found = pickle.loads(source)
+    name = getattr(found, "__name__", type(found).__name__)
+    if isinstance(found, type) or not hasattr(found, "act"):
+        found = found(robot)
+    return _checked(found, name)
+
+
+def pack_controller(controller: object) -> bytes:
+    """A controller, or what makes one, as bytes that cross to a worker: every shard gets a fresh copy.
+
+    Raises: ControllerError, it holds what cannot be copied, e.g. an open file.
+    """
+    import cloudpickle
+
+    try:
+        return cloudpickle.dumps(controller)
+    except Exception as error:  # whatever its attributes raise
+        raise ControllerError(
+            f"controller {type(controller).__name__} cannot be copied to workers ({error}): "
+            "hand over its class, or a function of the robot that makes it"
+        ) from error
+
+
+def _checked(controller: Controller, spec: str) -> Controller:
+    """Raises: ControllerError, UnknownNameError, it does not say what it is and reads."""
     info = getattr(controller, "info", None)
     if not isinstance(info, ControllerInfo):
         raise ControllerError(
             f"controller '{spec}' has no `info`, valid: a wbc_bench.controller.ControllerInfo"
         )
+    if not isinstance(info.name, str) or not info.name.strip():
+        raise ControllerError(f"controller '{spec}' has the name {info.name!r}, valid: a text, not empty")
     for signal in sorted(info.signals):
         if signal not in SIGNALS:
             raise UnknownNameError("signal", signal, SIGNALS, f"declared by controller '{spec}'")
@@ -72,11 +113,16 @@ def _load_attribute(module: str, attribute: str):
     if path is None:
         folder = str(Path.cwd())
     else:
-        if not path.exists():
+        if not path.is_file():
             raise ControllerError(f"controller file '{module}' does not exist")
+        if not path.stem.isidentifier():
+            raise ControllerError(
+                f"controller file '{module}': '{path.stem}' is no module name, valid: letters, digits and _"
+            )
         folder, module = str(path.parent), path.stem
     if folder not in sys.path:
         sys.path.insert(0, folder)
+    _forget_edited()
     try:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -90,6 +136,27 @@ def _load_attribute(module: str, attribute: str):
             f"controller file '{path}': the name '{module}' belongs to {found.__file__ or 'Python'}, "
             "give the file another"
         )
+    _LOADED[module] = _state_of(module)
     if not hasattr(found, attribute):
         raise ControllerError(f"controller '{module}:{attribute}': module has no '{attribute}'")
     return getattr(found, attribute)
+
+
+_LOADED: dict[str, dict[Path, int]] = {}  # a user's module -> its files when it was imported
+
+
+def _state_of(module: str) -> dict[Path, int]:
+    """Files of a user's module and of what it imports from its folder, with their times of change [ns]."""
+    return {path: path.stat().st_mtime_ns for path in provenance.sources(module)}
+
+
+def _forget_edited() -> None:
+    """Have edited modules imported anew: the digest of a controller is that of the files on disk."""
+    for module, files in list(_LOADED.items()):
+        if module in sys.modules and _state_of(module) != files:
+            del _LOADED[module]
+            importlib.invalidate_caches()
+            for name, loaded in list(sys.modules.items()):
+                file = getattr(loaded, "__file__", None)
+                if file and Path(file).resolve() in files:
+                    del sys.modules[name]

@@ -21,7 +21,7 @@ NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Range = tuple[float, float]  # (low, high)
 
-MAX_PUSHES = 2  # columns of a manifest; `load_protocol` refuses a schedule with room for more
+MAX_PUSHES = 2  # columns of a manifest; `read_protocol` refuses a schedule with room for more
 
 
 class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -194,7 +194,7 @@ class EvalProtocol(_Table, frozen=True):
         return meaning_digest(self)
 
 
-def load_protocol(path: Path) -> EvalProtocol:
+def read_protocol(path: Path) -> EvalProtocol:
     """The protocol of a TOML file.
 
     Raises:
@@ -210,7 +210,7 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
 
     Raises:
         UnknownNameError: no such released protocol (with the nearest names).
-        ProtocolError: see `load_protocol`.
+        ProtocolError: see `read_protocol`.
     """
     if name.endswith(".toml"):
         path = Path(name)
@@ -218,7 +218,12 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
         path = PROTOCOLS / f"{name}.toml"
         if not path.exists():
             raise UnknownNameError("protocol", name, protocol_names(), "--protocol")
-    return load_protocol(path), path
+    return read_protocol(path), path
+
+
+def load_protocol(name: str) -> EvalProtocol:
+    """A protocol by the name of a released one or by the path of a file. Raises: see `find_protocol`."""
+    return find_protocol(name)[0]
 
 
 def protocol_names() -> list[str]:

@@ -1,15 +1,16 @@
 """A shard of episodes under one controller, a control step at a time."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.controller import Controller, ProtocolAware, Target
+from wbc_bench.controller import Controller, JointCommand, ProtocolAware, Target
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.errors import ControllerError
+from wbc_bench.errors import BenchError, ControllerError, fault_of
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.outcomes import Outcome
@@ -75,14 +76,22 @@ class ControlLoop:
 
     def reset(self, target: Target) -> None:
         """Tell the controller what it begins with."""
-        self._controller.reset(self._rows.episode, self.observation, target)
+        with self._blamed("reset"):
+            self._controller.reset(self._rows.episode, self.observation, target)
 
     def advance(self, target: Target) -> Taken:
         """One control step towards a target.
 
-        Raises: ControllerError when the command has the wrong shape.
+        Raises: ControllerError when the controller fails, or its command has the wrong type or shape.
         """
-        command, active = self._controller.act(self.observation, target), self.active
+        active = self.active
+        with self._blamed("act"):
+            command = self._controller.act(self.observation, target)
+        if not isinstance(command, JointCommand):
+            raise ControllerError(
+                f"controller '{self._controller.info.name}' returned {type(command).__name__} from `act`, "
+                "valid: a wbc_bench.controller.JointCommand"
+            )
         q = np.asarray(command.q)
         if q.shape != (len(active), NUM_JOINTS):
             raise ControllerError(
@@ -96,6 +105,20 @@ class ControlLoop:
         if active.any():
             self._move(q, active)
         return taken
+
+    @contextmanager
+    def _blamed(self, method: str) -> Iterator[None]:
+        """What a controller raises, `SystemExit` too, in one line: its own frames, step and episodes."""
+        try:
+            yield
+        except BenchError:
+            raise
+        except (Exception, SystemExit) as error:
+            episodes = self._rows.episode
+            raise ControllerError(
+                f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "
+                f"of episodes {episodes.min()} to {episodes.max()}: {fault_of(error)}"
+            ) from error
 
     def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_]) -> None:
         pushed = self._push_step == self.step
@@ -116,7 +139,7 @@ class ControlLoop:
 def _terminations(protocol: EvalProtocol, state: State) -> list[tuple[Outcome, NDArray[np.bool_]]]:
     """Ways an episode ends early; the first that holds counts. Source: the paper, made deterministic."""
     limits = protocol.termination
-    tilted = state.base_rot_w[:, 2, 2] < np.cos(limits.tilt)
+    tilted = state.base_rot_w[:, 2, 2] < np.cos(min(limits.tilt, np.pi))  # no tilt is beyond pi
     low = state.base_pos_w[:, 2] < limits.base_height
     return [
         (Outcome.INVALID, state.diverged),

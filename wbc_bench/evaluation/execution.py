@@ -1,5 +1,6 @@
 """Runs that a store does not hold yet: the shards that are missing are computed, kept, and merged."""
 
+import hashlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -17,7 +18,8 @@ from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.shard import SHARD_EPISODES
 from wbc_bench.evaluation.workers import Engine, Result, Task, results
 from wbc_bench.progress import Progress
-from wbc_bench.registry import load_controller, spec_of_replicate
+from wbc_bench.provenance import Software
+from wbc_bench.registry import build_controller, spec_of_replicate
 from wbc_bench.results.store import ResultStore, Run, RunKey, RunWriter
 from wbc_bench.robot import load_robot
 
@@ -29,12 +31,13 @@ class Job:
     protocol: EvalProtocol
     manifest: EpisodeManifest
     manifest_sha256: str
-    spec: str
+    spec: str  # of the controller, or the name of one that was handed over as an object
     replicates: Sequence[int]
     episodes: int  # of each replicate
+    packed: bytes | None = None  # the object, see `registry.pack_controller`
 
 
-def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool = False) -> list[Run]:
+def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, overwrite: bool = False) -> list[Run]:
     """Evaluate what the store does not hold yet; finished shards of an interrupted evaluation are kept.
 
     Raises:
@@ -45,14 +48,14 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool
     with ExitStack() as stack:
         runs = []
         for job in jobs:
-            built: dict[str, tuple[Controller, str]] = {}  # spec -> controller, digest of its software
+            built: dict[str, tuple[Controller, Software]] = {}  # spec -> controller and what computes it
             for replicate in job.replicates:
                 # one controller may meet all replicates, or another one each
-                spec = spec_of_replicate(job.spec, replicate)
+                spec = job.spec if job.packed else spec_of_replicate(job.spec, replicate)
                 if spec not in built:
-                    controller = load_controller(spec, load_robot(job.protocol.robot))
-                    built[spec] = controller, provenance.software_digest(controller)
-                runs.append(_Run(job, spec, *built[spec], replicate, store, redo))
+                    controller = build_controller(job.packed or spec, load_robot(job.protocol.robot))
+                    built[spec] = controller, _software(controller, job.packed)
+                runs.append(_Run(job, spec, *built[spec], replicate, store, overwrite))
                 stack.callback(runs[-1].writer.close)
         tasks = (task for number, run in enumerate(runs) for task in run.tasks(number))
         shared = {
@@ -61,7 +64,7 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool
         }
         shared["git_commit"], shared["git_dirty"] = provenance.commit()
         for run in runs:
-            run.report_kept()
+            run.report_reused()
             run.finish_if_whole(shared)  # killed between the last shard and the merge
         missing = sum(len(run.writer.rows(shard)) for run in runs for shard in run.writer.missing)
         if missing:
@@ -75,6 +78,14 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool
         return [run.writer.finished for run in runs if run.writer.finished]
 
 
+def _software(controller: Controller, packed: bytes | None) -> Software:
+    """What computes a controller's episodes; of an object also its state."""
+    software = provenance.software(controller)
+    if packed is None:
+        return software
+    return software._replace(controller=hashlib.sha256(software.controller.encode() + packed).hexdigest())
+
+
 class _Run:
     """One run of a job while it is evaluated."""
 
@@ -83,13 +94,13 @@ class _Run:
         job: Job,
         spec: str,
         controller: Controller,
-        software: str,
+        software: Software,
         replicate: int,
         store: ResultStore,
-        redo: bool,
+        overwrite: bool,
     ) -> None:
         self.job, self.replicate = job, replicate
-        self._spec = spec  # of the controller that meets this replicate
+        self._spec, self._software = spec, software  # of the controller that meets this replicate
         self._controller = controller
         self._rows = job.manifest.of_replicate(replicate, job.episodes)
         self._started = float("inf")
@@ -101,23 +112,28 @@ class _Run:
             replicate=replicate,
             requested=len(self._rows),
             shard_episodes=SHARD_EPISODES,
-            software_sha256=software,
+            software_sha256=software.digest,
+            controller_sha256=software.controller,
         )
-        self.writer = RunWriter(store, key, redo)
+        self.writer = RunWriter(store, key, overwrite)
 
     def tasks(self, number: int) -> Iterator[Task]:
         for shard in self.writer.missing:
             rows = self._rows.take(np.asarray(self.writer.rows(shard)))
-            yield Task(number, shard, self._spec, self.job.protocol, rows)
+            packed = self.job.packed
+            software = "" if packed else self._software.digest  # the bytes are what was asked for
+            yield Task(number, shard, packed or self._spec, self.job.protocol, rows, software)
 
-    def report_kept(self) -> None:
+    def report_reused(self) -> None:
         """Say what is not evaluated again, and whether other code made it: nobody may take it for new."""
         writer, name = self.writer, f"{self.job.spec} replicate {self.replicate}"
         if writer.finished:
             record = writer.finished.record
-            line = f"{name}: kept, evaluated {record.created}"
+            line = f"{name}: reused, evaluated {record.created}"
+            if record.requested > writer.key.requested:
+                line += f", {record.requested} episodes, of which {writer.key.requested} are asked for"
             if record.software_sha256 != writer.key.software_sha256:
-                line += " by other code or packages than now; --redo evaluates it again"
+                line += ", by other code or packages than now; --overwrite evaluates it again"
             print(line, file=sys.stderr)
         elif writer.resumed:
             print(f"{name}: resumed after {writer.resumed} of {writer.num_shards} shards", file=sys.stderr)
@@ -133,6 +149,7 @@ class _Run:
         self.writer.finish(
             {
                 "controller_name": info.name,
+                "resolved_controller": self._spec,
                 "signals": sorted(info.signals),
                 "source": info.source,
                 "checkpoint_sha256": getattr(self._controller, "checkpoint_sha256", None),

@@ -56,9 +56,10 @@ class Task(NamedTuple):
 
     run: int
     shard: int
-    spec: str
+    controller: str | bytes  # as `evaluate_shard` takes it
     protocol: EvalProtocol
     rows: EpisodeManifest
+    software: str  # digest that the code must have on the worker
 
 
 class Result(NamedTuple):
@@ -75,7 +76,7 @@ def _work(task: Task) -> Result:
     """One shard, on the worker."""
     started = time.time()
     try:
-        episodes = evaluate_shard(task.spec, task.protocol, task.rows)
+        episodes = evaluate_shard(task.controller, task.protocol, task.rows, task.software)
     except BenchError as error:  # every subclass as one that survives pickling
         raise ControllerError(str(error)) from None
     rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MiB]

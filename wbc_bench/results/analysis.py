@@ -5,7 +5,7 @@ Pure functions of the episode records; no file is written here.
 
 import tomllib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -40,6 +40,11 @@ class Evaluated:
     spec: str
     records: tuple[Any, ...]
     episodes: pd.DataFrame  # the episode record, replicates concatenated
+
+    def first(self, episodes: int) -> "Evaluated":
+        """The same, with the first episodes of each replicate alone."""
+        chosen = column(self.episodes, "episode") < episodes
+        return self if chosen.all() else replace(self, episodes=subset(self.episodes, chosen))
 
     @property
     def requested(self) -> int:

@@ -11,7 +11,7 @@ import contextlib
 import fcntl
 import hashlib
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -38,7 +38,8 @@ class RunKey(msgspec.Struct, frozen=True, kw_only=True):
     replicate: int
     requested: int  # episodes
     shard_episodes: int
-    software_sha256: str  # all code that computes an episode, and its packages
+    software_sha256: str  # all code that computes an episode, its controller's too, and the packages
+    controller_sha256: str | None = None  # of the controller's own part of it
 
 
 class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,6 +56,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     requested: int
     completed: int
     episodes_sha256: str  # of episodes.parquet
+    resolved_controller: str | None = None  # the spec that met this replicate; None in records before 0.1.0
+    controller_sha256: str | None = None  # its code and files; None in records before 0.1.0
     checkpoint_sha256: str | None
     outcomes: dict[str, int]  # name -> episodes; they add up to `completed`
     software_sha256: str
@@ -87,9 +90,22 @@ class Run:
     record: RunRecord
 
     def episodes(self) -> pd.DataFrame:
-        """One row an episode.
+        """One row per episode. Raises: StoreError, see `table`."""
+        return self.table().to_pandas()
 
-        Raises: StoreError when the file is missing or not the one that the record was written for.
+    @property
+    def whole(self) -> bool:
+        """Whether the episodes are those that the record was written for."""
+        try:
+            self.table()
+        except StoreError:
+            return False
+        return True
+
+    def table(self) -> pa.Table:
+        """One row per episode, without what the file says of itself.
+
+        Raises: StoreError when the file is missing, or not the one that the record was written for.
         """
         path = self.path / "episodes.parquet"
         try:
@@ -102,7 +118,7 @@ class Run:
                 f"'{path}' is not what its run.json was written for: sha256 {sha256[:16]}..., "
                 f"recorded {self.record.episodes_sha256[:16]}..."
             )
-        return pq.read_table(pa.BufferReader(data)).to_pandas()
+        return pq.read_table(pa.BufferReader(data)).replace_schema_metadata()
 
 
 class ResultStore:
@@ -170,24 +186,26 @@ class RunWriter:
     One process at a time holds a run; the lock vanishes with the process, however it ends.
     """
 
-    def __init__(self, store: ResultStore, key: RunKey, redo: bool = False) -> None:
-        """Raises: StoreError when the folder is in use, or holds another answer and `redo` is False."""
+    def __init__(self, store: ResultStore, key: RunKey, overwrite: bool = False) -> None:
+        """Raises: StoreError when the folder is in use, or holds other episodes and `overwrite` is False.
+
+        With `overwrite` an earlier run is replaced when the new one is whole, and not before.
+        """
         self.key = key
         self.path = store.run_path(key.protocol, key.controller, key.replicate)
         self._shards = self.path / "shards"
         _make(self.path)
         self._lock = _lock(self.path)
         try:
-            for leftover in self.path.rglob(".*.tmp"):  # of a process that was killed while writing
-                leftover.unlink()
-            if redo:
-                _remove_files(self.path)
-            self.finished = self._finished()
+            for pattern in (".episodes.parquet.*.tmp", ".run.json.*.tmp", "shards/.shard_*.tmp"):
+                for leftover in self.path.glob(pattern):  # of a process that was killed while writing
+                    leftover.unlink()
+            self.finished = None if overwrite else self._finished()
             if self.finished:
                 self._drop_shards()  # it may have been killed between the record and the clean-up
                 self.done: dict[int, ShardCost] = {}
             else:
-                self.done = self._kept_shards()
+                self.done = self._kept_shards(overwrite)
         except BaseException:
             self.close()
             raise
@@ -209,14 +227,17 @@ class RunWriter:
 
     def write(self, shard: int, episodes: pa.Table, cost: ShardCost) -> None:
         """Keep one shard: a file that is there is whole."""
+        self._write(shard, episodes, cost)
+        self.done[shard] = cost
+
+    def _write(self, shard: int, episodes: pa.Table, cost: ShardCost) -> None:
         _make(self._shards)
         facts = {"key": msgspec.json.encode(self.key), "cost": msgspec.json.encode(cost)}
         write_atomic(self._shard_path(shard), _parquet(episodes, facts, checksum=True))
-        self.done[shard] = cost
 
     def finish(self, facts: Mapping[str, Any]) -> Run:
         """Merge the shards, write the record, then remove the shards; `facts` completes the record."""
-        tables = [pq.read_table(self._shard_path(k)) for k in range(self.num_shards)]
+        tables = [_read_table(self._shard_path(k)) for k in range(self.num_shards)]
         episodes = pa.concat_tables([table.replace_schema_metadata() for table in tables]).combine_chunks()
         key = self.key
         identity = {name: str(getattr(key, name)) for name in ("protocol", "protocol_digest", "controller")}
@@ -256,26 +277,57 @@ class RunWriter:
         path = self.path / "run.json"
         if not path.exists():
             return None
-        record = _read_record(path)
-        self._refuse_mixing(record, path, ignore={"software_sha256"})
-        return Run(self.path, record)
+        run = Run(self.path, _read_record(path))
+        record = run.record
+        self._refuse_mixing(record, path, ignore={"software_sha256", "controller_sha256", "requested"})
+        if record.controller_sha256 not in (None, self.key.controller_sha256):
+            raise StoreError(
+                f"'{path}' was evaluated when the code or the files of '{record.controller}' were others; "
+                "give another --out, or --overwrite to evaluate it again"
+            )
+        if self._shards.exists() and not run.whole:
+            return None  # killed while the episodes were replaced: the shards are there still
+        if record.requested < self.key.requested:
+            self._grow_from(run)
+            return None
+        return run
 
-    def _kept_shards(self) -> dict[int, ShardCost]:
-        """Whole shards of an earlier session; a damaged one is removed and computed again."""
+    def _grow_from(self, run: Run) -> None:
+        """Make shards of a run with fewer episodes; its last one, where it is short, is computed again."""
+        if run.record.software_sha256 != self.key.software_sha256:
+            raise StoreError(
+                f"'{run.path}' holds {run.record.requested} of the {self.key.requested} episodes asked for, "
+                "evaluated by other code or packages than now; give another --out, or --overwrite"
+            )
+        episodes, record = run.table(), run.record
+        for shard in range(self.num_shards):
+            rows = self.rows(shard)
+            if rows.stop <= len(episodes) and not self._shard_path(shard).exists():
+                share = len(rows) / len(episodes)
+                cost = ShardCost(round(record.compute_time_s * share, 3), record.max_rss_mib)
+                self._write(shard, episodes.slice(rows.start, len(rows)), cost)
+
+    def _kept_shards(self, overwrite: bool) -> dict[int, ShardCost]:
+        """Whole shards of an earlier session; a damaged one is moved aside and computed again.
+
+        With `overwrite` those of another key are not refused but computed again.
+        """
         kept = {}
         for shard in range(self.num_shards):
             path = self._shard_path(shard)
             if not path.exists():
                 continue
             try:
-                table = pq.read_table(path, page_checksum_verification=True)
+                table = _read_table(path, page_checksum_verification=True)
                 facts = table.schema.metadata or {}
                 key = msgspec.json.decode(facts[b"key"], type=RunKey)
                 cost = msgspec.json.decode(facts[b"cost"], type=ShardCost)
             except (OSError, KeyError, pa.ArrowException, msgspec.MsgspecError):
-                path.unlink()
+                path.replace(path.with_suffix(".damaged"))
                 continue
-            self._refuse_mixing(key, path)
+            if overwrite and msgspec.structs.replace(key, requested=self.key.requested) != self.key:
+                continue
+            self._refuse_mixing(key, path, ignore={"requested"})
             if len(table) == len(self.rows(shard)):
                 kept[shard] = cost
         return kept
@@ -285,13 +337,14 @@ class RunWriter:
             here, there = getattr(self.key, name), getattr(other, name)
             if name not in ignore and here != there:
                 raise StoreError(
-                    f"'{path}' answers another question: {name} is {there}, asked for {here}; "
-                    "give another --out, or --redo to evaluate it again"
+                    f"'{path}' was evaluated with another {name}: {there}, asked for {here}; "
+                    "give another --out, or --overwrite to evaluate it again"
                 )
 
     def _drop_shards(self) -> None:
-        if self._shards.exists():
-            _remove_files(self._shards)
+        for path in self._shards.glob("shard_*.parquet"):  # whatever else is there is not ours
+            path.unlink()
+        with contextlib.suppress(OSError):
             self._shards.rmdir()
 
 
@@ -334,11 +387,6 @@ def _lock(folder: Path) -> int:
     return descriptor
 
 
-def _remove_files(folder: Path) -> None:
-    for path in _files(folder):
-        path.unlink()
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    # The record goes first: what is left of a half-removed run must not look finished.
-    yield from sorted((p for p in folder.rglob("*") if p.is_file()), key=lambda p: p.name != "run.json")
+def _read_table(path: Path, **options: Any) -> pa.Table:
+    # its bytes: pyarrow would take a path with a tilde or a colon for a home folder or a URI
+    return pq.read_table(pa.BufferReader(path.read_bytes()), **options)

@@ -44,12 +44,20 @@ class LearnedController:
 
     formats = ("onnx",)
 
-    def __init__(self, robot: Robot, card: Card, engine: Engine, name: str, sha256: str) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        card: Card,
+        engine: Engine,
+        name: str,
+        sha256: str,
+        files: tuple[Path, ...] = (),
+    ) -> None:
         torch.set_num_threads(1)
         period = card.robot.control_period
         trained = f"{card.samples:.3g} control steps of {card.protocol}"
         self.info = ControllerInfo(
-            name, METHODS[card.method].signals, period, f"wbc_baselines.learned, {trained}"
+            name, METHODS[card.method].signals, period, f"wbc_baselines.learned, {trained}", files
         )
         self.card, self.checkpoint_sha256 = card, sha256
         self._robot, self._engine, self._decay = robot, engine, REFERENCE_DECAY
@@ -142,7 +150,7 @@ def from_checkpoint(robot: Robot, variant: str) -> LearnedController:
     path = checkpoint.find(variant)
     card, actor, estimator = checkpoint.load(path, robot)
     name = f"learned:{card.method}@{card.seed}"
-    return LearnedController(robot, card, Policy(actor, estimator), name, card.sha256)
+    return LearnedController(robot, card, Policy(actor, estimator), name, card.sha256, (path,))
 
 
 def _tensor(array: NDArray[np.float64]) -> Tensor:
@@ -166,4 +174,4 @@ def from_onnx(robot: Robot, variant: str) -> LearnedController:
     """The controller of `onnx:FILE`. Raises: CheckpointError, UnknownNameError."""
     engine = OnnxEngine(Path(variant))
     check_fit(engine.card, robot, None, variant)
-    return LearnedController(robot, engine.card, engine, f"onnx:{variant}", engine.sha256)
+    return LearnedController(robot, engine.card, engine, f"onnx:{variant}", engine.sha256, (Path(variant),))
