@@ -1,14 +1,19 @@
 """Protocol files: what is refused, with which words, and what a digest covers."""
 
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+import wbc_bench
 from wbc_bench.episodes.protocol import find_protocol, protocol_names, read_protocol
 from wbc_bench.errors import ProtocolError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
 
+ROOT = Path(__file__).parents[1]
 SMOKE = (PROTOCOLS / "smoke_v1.toml").read_text()
 REACH = (PROTOCOLS / "reach_v1.toml").read_text()
 
@@ -137,3 +142,26 @@ def test_undisturbed_protocols_ask_for_the_same_targets() -> None:
             )
             assert other.push.speed == 0
         assert others[0].noise == first.noise and others[0].randomization == first.randomization
+
+
+@pytest.mark.parametrize("where", ["a checkout", "a wheel"])
+def test_released_protocols_are_found(tmp_path, where):
+    """Beside the package in a checkout and an editable install, inside it in a wheel."""
+    package = tmp_path / "wbc_bench"
+    shutil.copytree(ROOT / "wbc_bench", package, ignore=shutil.ignore_patterns("__pycache__"))
+    folder = package if where == "a wheel" else tmp_path
+    shutil.copytree(ROOT / "protocols", folder / "protocols", ignore=shutil.ignore_patterns("*.parquet"))
+    code = (
+        "from wbc_bench.episodes.protocol import find_protocol, protocol_names;"
+        "print(find_protocol('smoke_v1')[1], len(protocol_names()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env={"PATH": ""}, capture_output=True, text=True
+    )
+    assert done.stdout.split()[0] == str(folder / "protocols" / "smoke_v1.toml"), done.stderr
+    assert int(done.stdout.split()[1]) == len(protocol_names())
+
+
+def test_an_editable_install_finds_those_of_its_checkout():
+    assert PROTOCOLS in (ROOT / "protocols", Path(wbc_bench.__file__).parent / "protocols")
+    assert (PROTOCOLS / "ablation_v1.parquet").is_file() and list((PROTOCOLS / "scripts").glob("*.toml"))

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from wbc_bench.episodes.ground_frame import GroundFrame, from_ground_frame, to_ground_frame
+from wbc_bench.episodes.planar import two_link
 from wbc_bench.episodes.protocol import WorkspaceTargets, find_protocol
 from wbc_bench.episodes.reach_targets import ReachPose, best_reach_pose, reach_poses
-from wbc_bench.episodes.static_solver import CLEARANCE, EFFORT_SHARE, JOINT_MARGIN, StaticSolver, two_link
+from wbc_bench.episodes.static_solver import CLEARANCE, EFFORT_SHARE, JOINT_MARGIN, StaticSolver
 from wbc_bench.episodes.targets import classify, solver_of
 from wbc_bench.episodes.workspace_targets import draw_workspace_target, stratum_of
 from wbc_bench.robot import NUM_LEG_JOINTS, RobotConfig, load_robot

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from wbc_bench.episodes.ground_frame import GroundFrame, to_ground_frame
+from wbc_bench.episodes.planar import turn, two_link, wrap
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot, RobotConfig, load_robot, mount_of, tcp_of
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 
@@ -47,32 +48,6 @@ class Witness(NamedTuple):
     margin: (
         float  # smallest normalised distance to a joint limit, a straight elbow or knee, or the soles' edge
     )
-
-
-def two_link(first: Array, second: Array, goal: Array) -> tuple[Array, Array, Array]:
-    """Pitch angles of two links in the x-z plane whose chain ends at a goal.
-
-    Ry(a) first + Ry(b) second = goal, for both signs of the bend. Source: law of cosines.
-
-    Args:
-        first, second: (2,) links (x, z) at zero angle [m].
-        goal: (..., 2) [m].
-
-    Returns:
-        a, b, bend: (2, ...) [rad]; bend is the angle from the first link to the second, zero when straight,
-        one sign a branch; NaN where the goal is out of reach.
-    """
-    r1, r2 = np.hypot(*first), np.hypot(*second)
-    cos_bend = ((goal**2).sum(-1) - r1**2 - r2**2) / (2 * r1 * r2)
-    bend = np.arccos(np.where(np.abs(cos_bend) <= 1, cos_bend, np.nan))
-    bend = np.stack([bend, -bend])
-    # a positive pitch lowers the polar angle in the x-z plane
-    polar = np.arctan2(goal[..., 1], goal[..., 0]) - np.arctan2(
-        r2 * np.sin(bend), r1 + r2 * np.cos(bend)
-    )  # of the first link
-    a = np.arctan2(first[1], first[0]) - polar
-    b = np.arctan2(second[1], second[0]) - (polar + bend)
-    return a, b, bend
 
 
 class _Bodies(NamedTuple):
@@ -153,11 +128,11 @@ class StaticSolver:
     def _bodies_at(self, base: Array, only_default: bool = False) -> _Bodies:
         """The leg configurations, either knee branch, of base poses (G, 3) that are within limits."""
         pitch = base[:, 2]
-        hip = base[:, :2] + _turn(pitch, self._hip)
+        hip = base[:, :2] + turn(pitch, self._hip)
         a, b, bend = two_link(self._thigh, self._shank, self._ankle - hip)  # (2, G)
         turns = np.stack([a - pitch, b - a, -b], axis=-1)  # (2, G, 3) of hip, knee, ankle about +y
         leg_q = np.zeros((2, len(base), NUM_LEG_JOINTS))
-        leg_q[..., _PITCH_COLUMNS] = _wrap(np.concatenate([turns, turns], axis=-1) * self._leg_sign)
+        leg_q[..., _PITCH_COLUMNS] = wrap(np.concatenate([turns, turns], axis=-1) * self._leg_sign)
         margin = self._joint_margin(leg_q[..., _PITCH_COLUMNS], _PITCH_COLUMNS)
         knee = _KNEE_COLUMNS[0]
         half_range = (self.robot.upper[knee] - self.robot.lower[knee]) / 2
@@ -209,7 +184,7 @@ class StaticSolver:
         plane = np.stack(
             [cos * wrist[:, 0] + sin * wrist[:, 1], np.broadcast_to(wrist[:, 2], cos.shape)], axis=-1
         )
-        elbow_goal = plane - self._shoulder - _turn(phi, self._wrist[[0, 2]])
+        elbow_goal = plane - self._shoulder - turn(phi, self._wrist[[0, 2]])
         a, b, bend = two_link(self._upper, self._forearm, elbow_goal)  # (2, 2, N)
         q = np.stack([np.broadcast_to(v, a.shape) for v in (j1, a, a - b, b - phi, j5, j6)], axis=-1)
         lower = self.robot.lower[NUM_LEG_JOINTS:]
@@ -240,7 +215,7 @@ class StaticSolver:
     def _best(self, bodies: _Bodies, pos: Array, rot: Array) -> Witness | None:
         x, z, pitch = bodies.base.T
         wrist = pos - rot @ self._wrist_to_tcp
-        root_x, root_z = np.moveaxis(_turn(pitch, self._arm_root[[0, 2]] + [0.0, self._shoulder[1]]), -1, 0)
+        root_x, root_z = np.moveaxis(turn(pitch, self._arm_root[[0, 2]] + [0.0, self._shoulder[1]]), -1, 0)
         apart = (wrist[0] - x - root_x) ** 2 + wrist[1] ** 2 + (wrist[2] - z - root_z) ** 2
         near = np.flatnonzero(apart <= self._reach**2)
         if len(near) == 0:
@@ -389,18 +364,6 @@ def static_solver(config: RobotConfig, com_margin: float, tilt: float, base_heig
 _PITCH_JOINTS = ("hip", "knee", "ankle")
 _PITCH_COLUMNS = [1, 2, 3, 5, 6, 7]  # of the eight leg joints
 _KNEE_COLUMNS = [2, 6]
-
-
-def _turn(pitch: Array, vector: Array) -> Array:
-    """Ry(pitch) applied to (x, z) vectors: (...,) and (..., 2) to (..., 2)."""
-    cos, sin = np.cos(pitch), np.sin(pitch)
-    x, z = vector[..., 0], vector[..., 1]
-    return np.stack([cos * x + sin * z, cos * z - sin * x], axis=-1)
-
-
-def _wrap(angle: Array) -> Array:
-    """Into [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _qpos(base: Array, leg_q: Array, arm_q: Array) -> Array:
