@@ -8,13 +8,16 @@ from synthetic import FakeRun, FakeStore, frame_of, methods_in, reach_store, rec
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.results import analysis, stats
 from wbc_bench.results.formatting import NONE
-from wbc_bench.results.study import ABLATION
+from wbc_bench.results.study import find_study
 from wbc_bench.results.table import Table, read_markdown
 from wbc_bench.results.tables.pairs import compare_table, pair_table
 from wbc_bench.results.tables.paper import paper_table
 from wbc_bench.results.tables.reach import height_table, reach_table
 from wbc_bench.results.tables.strata import outcome_table
 from wbc_bench.results.tables.write import write_compare_table, write_reach_tables, write_study_tables
+
+ABLATION = find_study("ablation_v1")
+REACH = find_study("reach_v1")
 
 
 @pytest.fixture(autouse=True)
@@ -169,7 +172,7 @@ def test_latex_is_escaped_and_balanced():
 def test_same_store_same_bytes(tmp_path):
     for name in ("one", "two"):
         write_study_tables(ABLATION, methods_in(study_store(count=30)), tmp_path / name)
-        write_reach_tables("reach_v1", methods_in(reach_store(), "reach_v1"), tmp_path / name)
+        write_reach_tables(REACH, methods_in(reach_store(), "reach_v1"), tmp_path / name)
         write_compare_table("ablation_v1", methods_in(study_store()), "ik", "ik:kinematic", tmp_path / name)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
     assert len(files) == 3 * (5 + 2 + 1)
@@ -221,6 +224,6 @@ def test_oscillation_near_the_ends():
 
 
 def test_reach_table_has_the_papers_ranges_and_the_grid():
-    table = reach_table("reach_v1", methods_in(reach_store(), "reach_v1"))
+    table = reach_table(REACH, methods_in(reach_store(), "reach_v1"))
     assert [row[4] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
-    assert len(height_table("reach_v1", methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41
+    assert len(height_table(REACH, methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41

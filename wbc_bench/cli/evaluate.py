@@ -91,12 +91,12 @@ class Ablation(_Evaluation):
     def run(self) -> None:
         from wbc_bench.publish import publish
         from wbc_bench.results.analysis import collect
-        from wbc_bench.results.study import ABLATION, Row
+        from wbc_bench.results.study import find_study
         from wbc_bench.results.tables.pairs import pair_table
         from wbc_bench.results.tables.paper import paper_table
 
-        study = ABLATION
-        specs = self.controllers or tuple(Row(*row).spec for row in study.rows)
+        study = find_study("ablation_v1")
+        specs = self.controllers or tuple(row.spec for row in study.rows)
         store = self._evaluate(
             study.protocol, specs, self.seeds, self.episodes, optional=not self.controllers
         )
@@ -122,6 +122,7 @@ class Reach(_Evaluation):
         from wbc_bench.episodes.protocol import ReachTargets, find_protocol
         from wbc_bench.publish import publish
         from wbc_bench.results.analysis import collect
+        from wbc_bench.results.study import studies_of
         from wbc_bench.results.tables.reach import reach_table
 
         protocol, _ = find_protocol(self.protocol)
@@ -129,7 +130,8 @@ class Reach(_Evaluation):
             raise UsageError(f"--protocol {self.protocol}: its targets are not of type 'reach'")
         store = self._evaluate(self.protocol, self.controller, None, None)
         publish(store, self.out)
-        print_table(reach_table(protocol.name, collect(store.runs(protocol.name))))
+        study = studies_of(protocol.name)[0]
+        print_table(reach_table(study, collect(store.runs(protocol.name))))
         print(f"tables, figures and report.html are under {self.out}")
 
 
@@ -154,7 +156,8 @@ class Eval(_Evaluation):
         from wbc_bench.results.tables.strata import outcome_table
 
         store = self._evaluate(self.protocol, self.controller, self.seeds, self.episodes)
-        study = Study(find_protocol(self.protocol)[0].name, ())
+        name = find_protocol(self.protocol)[0].name
+        study = Study(name, name)
         evaluated = collect(store.runs(study.protocol))
         print_table(paper_table(study, evaluated))
         print_table(outcome_table(study, evaluated))

@@ -3,11 +3,8 @@
 Pure functions of the episode records; no file is written here.
 """
 
-import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -135,12 +132,6 @@ def strata_of(episodes: pd.DataFrame) -> list[str]:
     """Strata present, in the usual order; `beyond` (no feasible pose exists) comes last."""
     present = set(episodes["stratum"])
     return [s for s in (*STRATA, "beyond") if s in present] + sorted(present - {*STRATA, "beyond"})
-
-
-@cache
-def paper_values() -> dict[str, Any]:
-    text = Path(__file__).with_name("paper_values.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text)
 
 
 class HeightRange(NamedTuple):

@@ -149,11 +149,12 @@ def write(
     evaluated: Mapping[str, Mapping[str, Evaluated]],
     results_dir: Path | str,
     beside: Path | str | None = None,
+    studies: Mapping[str, str] | None = None,
 ) -> Path:
     """Writes <results_dir>/report.html from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
-    will stand; `results_dir` when not given.
+    will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol.
 
     Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
     """
@@ -165,13 +166,15 @@ def write(
     records = [
         record for methods in evaluated.values() for method in methods.values() for record in method.records
     ]
-    # A section per protocol: its files begin with its name, and the longest such name owns a file.
+    # A section per protocol: its files begin with its name or a study's; the longest such name owns a file.
     protocols = list(evaluated)
-
     parts_of_report = [*protocols, "tracking", "doors"]
+    section_of = {name: of for name, of in (studies or {}).items() if of in protocols}
+    section_of |= {name: name for name in parts_of_report}
 
     def owner(stem: str) -> str:
-        return max((p for p in parts_of_report if stem == p or stem.startswith(f"{p}_")), key=len, default="")
+        names = (name for name in section_of if stem == name or stem.startswith(f"{name}_"))
+        return section_of.get(max(names, key=len, default=""), "")
 
     sections = []
     for protocol in [*parts_of_report, ""]:

@@ -129,17 +129,17 @@ def write_study_figures(study: Study, evaluated: Mapping[str, Evaluated], out_di
         figure = Figure(figsize=(6.4, 1.2 + 0.85 * len(methods)))
         ax = success_by_stratum(figure.subplots(), methods)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        paths += save(figure, f"{study.protocol}_success", out_dir)
+        paths += save(figure, f"{study.name}_success", out_dir)
 
         figure = Figure(figsize=(7.2, 1.3 + 0.5 * len(methods)))
         ax = outcome_bars(figure.subplots(), methods)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        paths += save(figure, f"{study.protocol}_outcomes", out_dir)
+        paths += save(figure, f"{study.name}_outcomes", out_dir)
 
         figure = Figure(figsize=(7.6, 3.5))
         left, right = figure.subplots(1, 2, sharey=True)
         error_cdf(left, methods, "position_error").set_title("Position")
         error_cdf(right, methods, "orientation_error").set(title="Orientation", ylabel="")
         figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        paths += save(figure, f"{study.protocol}_errors", out_dir)
+        paths += save(figure, f"{study.name}_errors", out_dir)
     return paths

@@ -15,7 +15,6 @@ from wbc_bench.results.analysis import (
     by_height,
     median,
     oscillation,
-    paper_values,
     reach_range,
     reached,
     stood,
@@ -29,6 +28,7 @@ from wbc_bench.results.formatting import (
     NONE,
     number_text,
 )
+from wbc_bench.results.study import Study
 from wbc_bench.results.table import Table
 
 
@@ -36,12 +36,13 @@ def _range(span: HeightRange) -> str:
     return "none" if np.isnan(span.low) else f"{span.low * CM:.0f}–{span.high * CM:.0f}"
 
 
-def reach_table(protocol: str, evaluated: Mapping[str, Evaluated]) -> Table:
+def reach_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
     """Lowest and highest height of each controller and variant, and how much it sways near them."""
     rows, data = [], []
-    block = paper_values()["reach"]
-    for name, (low, high) in ((k, v) for k, v in block.items() if k != "source"):
-        rows.append((f"{name}, paper ({block['source']})", *[NONE] * 3, f"{low}–{high}", *[NONE] * 4))
+    paper = study.paper
+    for name, (low, high) in (paper.ranges_cm if paper else {}).items():
+        place = paper.place if paper else ""
+        rows.append((f"{name}, paper ({place})", *[NONE] * 3, f"{low:g}–{high:g}", *[NONE] * 4))
         data.append({"controller": name, "source": "paper", "low_cm": low, "high_cm": high})
     for spec, method in evaluated.items():
         for k, (condition, orientation, episodes) in enumerate(variants(method.episodes)):
@@ -80,14 +81,14 @@ def reach_table(protocol: str, evaluated: Mapping[str, Evaluated]) -> Table:
         "Oscillation in the final 1 s, median over episodes that did not terminate: within "
         f"{END_ZONE * CM:.0f} cm of the low end of the range reached, between, within as much of the high "
         "end. SPARC is the spectral arc length of the end-effector's speed (0 is smoothest).",
-        "The paper's ranges are of a real robot; it states no rule for what counts as reached.",
+        *(paper.notes if paper else ()),
     )
     frame = pd.DataFrame(data)
     frame["episodes"] = frame["episodes"].astype("Int64") if "episodes" in frame else pd.NA
-    return Table(f"{protocol}", f"{protocol}: heights reached", header, tuple(rows), notes, frame)
+    return Table(study.name, f"{study.name}: heights reached", header, tuple(rows), notes, frame)
 
 
-def height_table(protocol: str, method: Evaluated) -> Table:
+def height_table(study: Study, method: Evaluated) -> Table:
     """Success with its interval and median error at every height, a pair of columns a variant."""
     parts = [(c, o, dict(by_height(episodes))) for c, o, episodes in variants(method.episodes)]
     heights = sorted({height for _, _, groups in parts for height in groups})
@@ -135,5 +136,5 @@ def height_table(protocol: str, method: Evaluated) -> Table:
         "median position error over the final 1 s of episodes that did not terminate (in brackets: how many "
         "did).",
     )
-    name, title = f"{protocol}_heights_{folder_name(method.spec)}", f"{protocol}: {method.spec} by height"
+    name, title = f"{study.name}_heights_{folder_name(method.spec)}", f"{study.name}: {method.spec} by height"
     return Table(name, title, ("Height (cm)", *labels), tuple(rows), notes, pd.DataFrame(data))
