@@ -13,6 +13,7 @@ import pytest
 
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import ensure_writable, folder_name, write_atomic
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
 from wbc_bench.results.store import ResultStore, RunKey, RunWriter, ShardCost
 
@@ -258,6 +259,15 @@ def test_record_round_trips(tmp_path):
     (run,) = finished(tmp_path).runs()
     again = msgspec.json.decode((run.path / "run.json").read_bytes(), type=store_module.RunRecord)
     assert again == run.record
+
+
+def test_a_record_of_before_has_the_rule_of_v1(tmp_path):
+    (run,) = finished(tmp_path).runs()
+    old = msgspec.json.decode((run.path / "run.json").read_bytes())
+    del old["rule"]
+    (run.path / "run.json").write_bytes(msgspec.json.encode(old))
+    (again,) = ResultStore(tmp_path).runs()
+    assert again.record.rule == SuccessRule(0.05, np.radians(7.0), 1.0, 10.0)
 
 
 @pytest.mark.parametrize(

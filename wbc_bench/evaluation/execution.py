@@ -16,6 +16,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.shard import SHARD_EPISODES
 from wbc_bench.evaluation.workers import Engine, Result, Task, results
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.progress import Progress
 from wbc_bench.registry import load_controller, spec_of_replicate
 from wbc_bench.results.store import ResultStore, Run, RunKey, RunWriter
@@ -130,6 +131,8 @@ class _Run:
         if self.writer.finished or self.writer.missing:
             return
         now, info = time.time(), self._controller.info
+        protocol = self.job.protocol
+        success, horizon = protocol.success, protocol.episodes.horizon
         self.writer.finish(
             {
                 "controller_name": info.name,
@@ -138,6 +141,7 @@ class _Run:
                 "checkpoint_sha256": getattr(self._controller, "checkpoint_sha256", None),
                 "wall_time_s": round(max(0.0, now - self._started), 3),  # 0 when only the merge was left
                 "created": datetime.fromtimestamp(now, UTC).isoformat(timespec="seconds"),
+                "rule": SuccessRule(success.position, success.orientation, success.window, horizon),
                 **shared,
             }
         )

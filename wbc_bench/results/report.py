@@ -13,8 +13,10 @@ from typing import Any
 import msgspec
 
 from wbc_bench.errors import StoreError
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import gallery
-from wbc_bench.results.analysis import Evaluated
+from wbc_bench.results.analysis import Evaluated, rule_of
+from wbc_bench.results.formatting import window_text
 from wbc_bench.results.table import code_html, read_markdown
 
 CSS = """
@@ -58,17 +60,17 @@ GIVEN_SECTIONS = (
     ("latent_", "Latent spaces"),
     ("learning_curves", "Learning curves"),
 )
-CAPTIONS = {  # end of a figure's name -> what it shows
+CAPTIONS = {  # end of a figure's name -> what it shows; {window} is that of the success rule
     "_success": "Success by stratum of the targets.",
     "_outcomes": "How the episodes ended.",
-    "_errors": "Share of all episodes that stood with an error up to x, in the final second.",
+    "_errors": "Share of all episodes that stood with an error up to x, in the {window}.",
     "_workspace": "Targets, and where they are reached: success over bins of target positions, "
     "projected on the vertical plane and on the ground. Faint bins hold few episodes, blank ones none.",
     "_targets": "Targets of the protocol by stratum, from the side and from above.",
     "tracking": "Error of the hand over time while its target moves.",
 }
 REACH_CAPTION = (
-    "Straight ahead over height: the range reached, success, and in the final second the position error and "
+    "Straight ahead over height: the range reached, success, and in the {window} the position error and "
     "how the hand oscillates, as speed and as smoothness (spectral arc length, 0 is smoothest)."
 )
 
@@ -178,14 +180,14 @@ def write(
 
     sections = []
     for protocol in [*parts_of_report, ""]:
+        rule = rule_of(evaluated.get(protocol, {}))
         own = sorted((path for path in tables if owner(path.stem) == protocol), key=_order)
         shown = [read_markdown(path).html() for path in own]
-        images = [
-            figure_html(_figure(root, stem), _caption(stem)) for stem in figures if owner(stem) == protocol
-        ]
+        stems = (stem for stem in figures if owner(stem) == protocol)
+        images = [figure_html(_figure(root, stem), _caption(stem, rule)) for stem in stems]
         parts = [*shown[:1], *images, *shown[1:]]  # what most readers came for, first
         if protocol in protocols:
-            parts.append(f'<p class="rule">{code_html(gallery.RULE)}</p>\n')
+            parts.append(f'<p class="rule">{code_html(gallery.order_text(rule))}</p>\n')
             methods = evaluated[protocol].values()
             parts += [gallery.gallery_html(protocol, method, beside) for method in methods]
         if parts:
@@ -235,9 +237,9 @@ def _is_given(stem: str) -> bool:
     return any(stem.startswith(prefix) for prefix, _ in GIVEN_SECTIONS)
 
 
-def _caption(stem: str) -> str:
+def _caption(stem: str, rule: SuccessRule) -> str:
     found = [caption for end, caption in CAPTIONS.items() if stem.endswith(end)]
-    return found[0] if found else REACH_CAPTION
+    return (found[0] if found else REACH_CAPTION).format(window=window_text(rule))
 
 
 def _figure(root: Path, stem: str) -> Path:

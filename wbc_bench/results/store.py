@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import folder_name, write_atomic
-from wbc_bench.outcomes import Outcome
+from wbc_bench.outcomes import Outcome, SuccessRule
 
 LABELS = ("stratum", "condition", "orientation", "outcome")  # few values: dictionary-encoded
 
@@ -70,6 +70,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     compute_time_s: float  # [s] summed over shards
     max_rss_mib: float  # [MiB] largest resident set of any worker
     created: str  # UTC, ISO 8601
+    # A record without the field was made under the v1 protocols, whose rule the defaults are.
+    rule: SuccessRule = SuccessRule()
 
 
 class ShardCost(NamedTuple):

@@ -13,7 +13,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 from wbc_bench.files import folder_name
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import (
-    REACH_TOLERANCE,
     Evaluated,
     by_height,
     column,
@@ -109,7 +108,7 @@ def reach_figure(study: Study, method: Evaluated) -> Figure:
         bars = _paper_ranges(study)
         for condition, episodes in ((c, e) for c, o, e in parts if o == orientation):
             colour = CONDITION_COLOURS.get(condition, GREEN)
-            span = reach_range(episodes)
+            span = reach_range(episodes, method.rule)
             bars.append((condition, span.low * CM, span.high * CM, colour))
             reach_success(success, episodes, condition, colour)
             reach_metric(error, episodes, "position_error", condition, colour, 0.95, CM)
@@ -118,7 +117,7 @@ def reach_figure(study: Study, method: Evaluated) -> Figure:
             for ax in ax_column[1:]:
                 _shade_beyond(ax, episodes)
         reach_bars(ranges, bars).set_title(f"Gripper {orientation}: range reached (cm)")
-        error.axhline(REACH_TOLERANCE * CM, color=GREY, lw=0.9, ls="--")
+        error.axhline(method.rule.position * CM, color=GREY, lw=0.9, ls="--")
         smoothness.set_xlabel("Target height (cm)")
         smoothness.xaxis.set_major_locator(MultipleLocator(25))
         smoothness.set_xlim(-3, 203)

@@ -13,6 +13,7 @@ from wbc_bench.results import stats
 from wbc_bench.results.analysis import (
     Evaluated,
     Mask,
+    rule_of,
     subset,
 )
 from wbc_bench.results.analysis import column as series
@@ -21,6 +22,8 @@ from wbc_bench.results.formatting import (
     DEG,
     NONE,
     spread_text,
+    tolerance_text,
+    window_text,
 )
 from wbc_bench.results.study import Paper, Study, study_rows
 from wbc_bench.results.table import Table
@@ -121,11 +124,12 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
             rows.append(("", "(paper)", f"{episodes}/{episodes}" if episodes else NONE, NONE, *cells))
             data.append({**base, "source": "paper", "note": "", **_flat(printed)})
     header = ("Study", "Method", "Episodes", "Errors over", *(column.header for column in COLUMNS))
+    rule = rule_of(evaluated)
     if terminated:
         name, title = f"{study.name}_all", f"{study.name}: errors over all episodes"
         notes = [
             "As the table before, with the episodes that terminated: their error is the mean over the last "
-            "1 s before the end, and an episode that ended before its first step has none."
+            f"{rule.window:g} s before the end, and an episode that ended before its first step has none."
         ]
     else:
         name, title = study.name, f"{study.name}: errors over episodes that did not terminate"
@@ -162,11 +166,13 @@ def _integers(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _paper_notes(study: Study, evaluated: Mapping[str, Evaluated]) -> list[str]:
+    rule = rule_of(evaluated)
     notes = [
-        "Episodes: completed/requested. Success counts every episode. ± is the sample standard deviation "
-        "over replicates.",
-        "Errors are means over the final 1 s of an episode; mean and P95 are over the episodes that did not "
-        "end in a fall, an illegal contact or NaN (`Errors over` of them). "
+        "Episodes: completed/requested. Success counts every episode: both errors inside "
+        f"{tolerance_text(rule)} at every step of the {window_text(rule)} of {rule.horizon:g} s. ± is the "
+        "sample standard deviation over replicates.",
+        f"Errors are means over the {window_text(rule)} of an episode; mean and P95 are over the episodes "
+        "that did not end in a fall, an illegal contact or NaN (`Errors over` of them). "
         "The table over all episodes stands beside this one.",
     ]
     if study.paper:
