@@ -201,7 +201,7 @@ def test_a_second_size_is_refused(capsys, tiny, tmp_path):
     evaluate(tiny, tmp_path / "out", "--episodes", 3)
     capsys.readouterr()
     line = fails(capsys, "eval", "--controller", "hold", "--protocol", tiny, "--out", tmp_path / "out")
-    assert "requested is 3, asked for 6" in line and "--redo" in line
+    assert "requested is 3, asked for 6" in line and "--overwrite" in line
     evaluate(tiny, tmp_path / "out", "--redo")
 
 

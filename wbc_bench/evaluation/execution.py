@@ -1,4 +1,4 @@
-"""Runs that a store does not hold yet: the shards that are missing are computed, kept, and merged."""
+"""Runs that a store does not hold yet: the shards that are missing are computed, written, and merged."""
 
 import sys
 import time
@@ -36,10 +36,10 @@ class Job:
 
 
 def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool = False) -> list[Run]:
-    """Evaluate what the store does not hold yet; finished shards of an interrupted evaluation are kept.
+    """Evaluate what the store does not hold yet; finished shards of an interrupted evaluation are reused.
 
     Raises:
-        StoreError: the store holds other answers under the same name, is in use or is full.
+        StoreError: the store holds a different evaluation under the same name, is in use or is full.
         ControllerError: a controller cannot be built or breaks the interface.
         ExecutionError: workers cannot be started or keep dying.
     """
@@ -62,7 +62,7 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, redo: bool
         }
         shared["git_commit"], shared["git_dirty"] = provenance.commit()
         for run in runs:
-            run.report_kept()
+            run.report_reused()
             run.finish_if_whole(shared)  # killed between the last shard and the merge
         missing = sum(len(run.writer.rows(shard)) for run in runs for shard in run.writer.missing)
         if missing:
@@ -111,14 +111,14 @@ class _Run:
             rows = self._rows.take(np.asarray(self.writer.rows(shard)))
             yield Task(number, shard, self._spec, self.job.protocol, rows)
 
-    def report_kept(self) -> None:
+    def report_reused(self) -> None:
         """Say what is not evaluated again, and whether other code made it: nobody may take it for new."""
         writer, name = self.writer, f"{self.job.spec} replicate {self.replicate}"
         if writer.finished:
             record = writer.finished.record
-            line = f"{name}: kept, evaluated {record.created}"
+            line = f"{name}: reused, evaluated {record.created}"
             if record.software_sha256 != writer.key.software_sha256:
-                line += " by other code or packages than now; --redo evaluates it again"
+                line += " by other code or packages than now; --overwrite evaluates it again"
             print(line, file=sys.stderr)
         elif writer.resumed:
             print(f"{name}: resumed after {writer.resumed} of {writer.num_shards} shards", file=sys.stderr)

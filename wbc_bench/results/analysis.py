@@ -69,7 +69,7 @@ class Evaluated:
 def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
     """Spec -> its runs, sorted by spec, of runs under one protocol; reads their episodes, so call it once.
 
-    Raises: StoreError when two runs answered different protocols or manifests under the same name.
+    Raises: StoreError when two runs under one name were evaluated with different protocols or manifests.
     """
     runs = sorted(runs, key=lambda run: (run.record.controller, run.record.replicate))
     first: dict[str, tuple[str, str]] = {}  # what must agree -> (value, the first run that said so)
