@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results.analysis import Evaluated, collect
 
 STRATA = ("arm", "posture", "step")
@@ -48,6 +49,7 @@ def record(controller: str, replicate: int, frame: pd.DataFrame, **changes) -> S
             "workers": 2,
         },
         "created": "2026-01-01T00:00:00Z",
+        "rule": SuccessRule(),
     }
     return SimpleNamespace(**(values | changes))
 

@@ -25,12 +25,13 @@ def synthetic(
     episode = np.repeat(np.arange(episodes), steps)
     offset = rng.normal(size=(episodes, columns))[episode]
     means = np.eye(3, columns) * separation
-    latent = means[latents.phase_of(error)] + rng.normal(size=(len(error), columns)) * 0.3 + offset
+    phase = latents.phase_of(error, 0.05)
+    latent = means[phase] + rng.normal(size=(len(error), columns)) * 0.3 + offset
     return Samples(latent, error, episode, np.tile(np.arange(steps) * 0.02, episodes))  # pyright: ignore[reportArgumentType]
 
 
 def test_phases_follow_the_error():
-    phase = latents.phase_of(np.array([0.0, 0.049, 0.05, 0.499, 0.5, 3.0]))
+    phase = latents.phase_of(np.array([0.0, 0.049, 0.05, 0.499, 0.5, 3.0]), 0.05)
     assert [latents.PHASES[k] for k in phase] == [*["precision"] * 2, *["approach"] * 2, *["locomotion"] * 2]
 
 

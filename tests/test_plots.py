@@ -10,7 +10,10 @@ from wbc_bench.results import analysis
 from wbc_bench.results.figures.reach import write_reach_figures
 from wbc_bench.results.figures.study import error_cdf, outcome_bars, success_by_stratum, write_study_figures
 from wbc_bench.results.figures.targets import write_targets
-from wbc_bench.results.study import ABLATION, methods_of
+from wbc_bench.results.study import find_study, methods_of
+
+ABLATION = find_study("ablation_v1")
+REACH = find_study("reach_v1")
 
 
 def targets() -> pd.DataFrame:
@@ -26,7 +29,7 @@ def methods() -> list[tuple[str, analysis.Evaluated]]:
 
 def test_same_store_same_bytes(tmp_path):
     for folder in (tmp_path / "one", tmp_path / "two"):
-        write_reach_figures("reach_v1", methods_in(reach_store(), "reach_v1"), folder)
+        write_reach_figures(REACH, methods_in(reach_store(), "reach_v1"), folder)
         write_targets(targets(), "ablation_v1", folder)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
     assert len(files) == 2 * 2
@@ -45,7 +48,7 @@ def test_files_of_a_study_carry_no_date_and_no_program(tmp_path):
 
 def test_nothing_to_draw_writes_nothing(tmp_path):
     assert write_study_figures(ABLATION, methods_in(FakeStore([])), tmp_path) == []
-    assert write_reach_figures("reach_v1", methods_in(FakeStore([]), "reach_v1"), tmp_path) == []
+    assert write_reach_figures(REACH, methods_in(FakeStore([]), "reach_v1"), tmp_path) == []
 
 
 def test_a_plot_returns_its_axes():

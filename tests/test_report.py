@@ -11,8 +11,11 @@ from wbc_bench.errors import StoreError
 from wbc_bench.results import gallery, report, stats
 from wbc_bench.results.analysis import collect_all
 from wbc_bench.results.figures.reach import write_reach_figures
-from wbc_bench.results.study import ABLATION
+from wbc_bench.results.study import find_study
 from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
+
+ABLATION = find_study("ablation_v1")
+REACH = find_study("reach_v1")
 
 
 @pytest.fixture(autouse=True)
@@ -24,16 +27,16 @@ def full_store() -> FakeStore:
     return FakeStore(study_store(count=30).all_runs + reach_store().all_runs)
 
 
-def report_of(store: FakeStore, *folders: Path) -> str:
+def report_of(store: FakeStore, made: Path, beside: Path | None = None) -> str:
     """The page that is written of a store."""
-    return report.write(collect_all(store.runs()), *folders).read_text(encoding="utf-8")
+    return report.write(collect_all(store.runs()), made, beside).read_text(encoding="utf-8")
 
 
 def test_report_holds_everything_and_loads_nothing(tmp_path):
     store = full_store()
     write_study_tables(ABLATION, methods_in(store), tmp_path / "tables")
-    write_reach_tables("reach_v1", methods_in(store, "reach_v1"), tmp_path / "tables")
-    write_reach_figures("reach_v1", methods_in(store, "reach_v1"), tmp_path / "figures")
+    write_reach_tables(REACH, methods_in(store, "reach_v1"), tmp_path / "tables")
+    write_reach_figures(REACH, methods_in(store, "reach_v1"), tmp_path / "figures")
     path = report.write(collect_all(store.runs()), tmp_path)
     text = path.read_text(encoding="utf-8")
     assert path == tmp_path / "report.html"
@@ -51,7 +54,7 @@ def test_report_holds_everything_and_loads_nothing(tmp_path):
 def test_each_table_stands_under_its_own_protocol(tmp_path):
     store = full_store()
     write_study_tables(ABLATION, methods_in(store), tmp_path / "tables")
-    write_reach_tables("reach_v1", methods_in(store, "reach_v1"), tmp_path / "tables")
+    write_reach_tables(REACH, methods_in(store, "reach_v1"), tmp_path / "tables")
     text = report_of(store, tmp_path)
     ablation, reach = text.index('<h2 id="s0">ablation_v1'), text.index('<h2 id="s1">reach_v1')
     assert ablation < text.index("ik vs hold") < reach < text.index("38–163")

@@ -1,4 +1,4 @@
-"""The store: atomic, resumable, and never mixing answers to different questions."""
+"""The store: atomic, resumable, and never mixing runs of different keys."""
 
 import errno
 import os
@@ -13,6 +13,7 @@ import pytest
 
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import ensure_writable, folder_name, write_atomic
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
 from wbc_bench.results.store import ResultStore, RunKey, RunWriter, ShardCost
 
@@ -129,7 +130,7 @@ def test_killed_between_record_and_clean_up(tmp_path):
 
 @pytest.mark.parametrize("field", ["protocol_digest", "manifest_sha256", "controller"])
 @pytest.mark.parametrize("whole", [True, False])
-def test_another_question_is_refused(tmp_path, field, whole):
+def test_a_run_of_another_key_is_refused(tmp_path, field, whole):
     if whole:
         store = finished(tmp_path)
     else:
@@ -166,6 +167,19 @@ def test_load_refuses_to_mix_digests(tmp_path):
         store.load("p", "a:b")
     with pytest.raises(UnknownNameError, match="a:b"):
         store.load("p", "a:c")
+
+
+def test_a_copied_folder_is_not_counted_twice(tmp_path):
+    store = finished(tmp_path)
+    (run,) = store.runs()
+    shutil.copytree(run.path, run.path.with_name("replicate_5"))
+    with pytest.raises(StoreError, match=r"replicate_5' holds the run of p/a-b/replicate_0"):
+        store.runs()
+    record = msgspec.json.decode((run.path / "run.json").read_bytes()) | {"replicate": 5}
+    (run.path.with_name("replicate_5") / "run.json").write_bytes(msgspec.json.encode(record))
+    (_, copy) = store.runs()
+    with pytest.raises(StoreError, match=r"replicate_5.* was written for replicate '0', .* says '5'"):
+        copy.episodes()
 
 
 def test_altered_episodes_are_noticed(tmp_path):
@@ -258,6 +272,15 @@ def test_record_round_trips(tmp_path):
     (run,) = finished(tmp_path).runs()
     again = msgspec.json.decode((run.path / "run.json").read_bytes(), type=store_module.RunRecord)
     assert again == run.record
+
+
+def test_a_record_of_before_has_the_rule_of_v1(tmp_path):
+    (run,) = finished(tmp_path).runs()
+    old = msgspec.json.decode((run.path / "run.json").read_bytes())
+    del old["rule"]
+    (run.path / "run.json").write_bytes(msgspec.json.encode(old))
+    (again,) = ResultStore(tmp_path).runs()
+    assert again.record.rule == SuccessRule(0.05, np.radians(7.0), 1.0, 10.0)
 
 
 @pytest.mark.parametrize(

@@ -3,18 +3,26 @@
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from synthetic import FakeRun, FakeStore, frame_of, methods_in, reach_store, record, study_store
 
 from wbc_bench.errors import StoreError, UnknownNameError
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import analysis, stats
+from wbc_bench.results.figures.study import error_cdf
 from wbc_bench.results.formatting import NONE
-from wbc_bench.results.study import ABLATION
+from wbc_bench.results.gallery import order_text
+from wbc_bench.results.study import find_study, methods_of
 from wbc_bench.results.table import Table, read_markdown
 from wbc_bench.results.tables.pairs import compare_table, pair_table
 from wbc_bench.results.tables.paper import paper_table
 from wbc_bench.results.tables.reach import height_table, reach_table
 from wbc_bench.results.tables.strata import outcome_table
 from wbc_bench.results.tables.write import write_compare_table, write_reach_tables, write_study_tables
+
+ABLATION = find_study("ablation_v1")
+REACH = find_study("reach_v1")
+RULE = SuccessRule()
 
 
 @pytest.fixture(autouse=True)
@@ -169,7 +177,7 @@ def test_latex_is_escaped_and_balanced():
 def test_same_store_same_bytes(tmp_path):
     for name in ("one", "two"):
         write_study_tables(ABLATION, methods_in(study_store(count=30)), tmp_path / name)
-        write_reach_tables("reach_v1", methods_in(reach_store(), "reach_v1"), tmp_path / name)
+        write_reach_tables(REACH, methods_in(reach_store(), "reach_v1"), tmp_path / name)
         write_compare_table("ablation_v1", methods_in(study_store()), "ik", "ik:kinematic", tmp_path / name)
     files = sorted(path.name for path in (tmp_path / "one").iterdir())
     assert len(files) == 3 * (5 + 2 + 1)
@@ -188,39 +196,57 @@ def heights(error_cm: list[float], outcome: str = "missed") -> pd.DataFrame:
 
 
 def test_the_range_is_the_longest_run_of_neighbours():
-    span = analysis.reach_range(heights([1, 9, 1, 1, 4.9, 5.1, 1, 1]))
+    span = analysis.reach_range(heights([1, 9, 1, 1, 4.9, 5.1, 1, 1]), RULE)
     assert (span.low, span.high) == pytest.approx((0.10, 0.20)) and span.reached == 6
 
 
 def test_nothing_reached_is_no_range():
-    span = analysis.reach_range(heights([9, 9]))
+    span = analysis.reach_range(heights([9, 9]), RULE)
     assert np.isnan(span.low) and span.reached == 0
 
 
 def test_a_height_at_which_half_fell_is_not_reached():
     frame = heights([1.0])
-    assert analysis.reached(frame)
-    assert analysis.reached(frame.assign(outcome=["fell", "missed", "missed", "missed"]))
-    assert not analysis.reached(frame.assign(outcome=["fell", "fell", "missed", "missed"]))
-    assert not analysis.reached(frame.assign(position_error=np.nan))
+    assert analysis.reached(frame, RULE)
+    assert analysis.reached(frame.assign(outcome=["fell", "missed", "missed", "missed"]), RULE)
+    assert not analysis.reached(frame.assign(outcome=["fell", "fell", "missed", "missed"]), RULE)
+    assert not analysis.reached(frame.assign(position_error=np.nan), RULE)
 
 
 def test_strict_range_asks_for_success():
     frame = pd.concat(
         [heights([1, 1]), heights([1, 1, 1], "success").assign(height=[0.1] * 4 + [0.15] * 4 + [0.2] * 4)]
     )
-    assert analysis.reach_range(frame).low == 0.0
-    assert analysis.reach_range(frame, strict=True)[:2] == pytest.approx((0.10, 0.20))
+    assert analysis.reach_range(frame, RULE).low == 0.0
+    assert analysis.reach_range(frame, RULE, strict=True)[:2] == pytest.approx((0.10, 0.20))
 
 
 def test_oscillation_near_the_ends():
     frame = heights([1.0] * 21).assign(ee_speed_rms=np.repeat(np.linspace(0.0, 0.2, 21), 4))
-    span = analysis.reach_range(frame)
+    span = analysis.reach_range(frame, RULE)
     low, middle, high = analysis.oscillation(frame, span, "ee_speed_rms")
     assert (low, middle, high) == pytest.approx((0.01, 0.10, 0.19))
 
 
 def test_reach_table_has_the_papers_ranges_and_the_grid():
-    table = reach_table("reach_v1", methods_in(reach_store(), "reach_v1"))
+    table = reach_table(REACH, methods_in(reach_store(), "reach_v1"))
     assert [row[4] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
-    assert len(height_table("reach_v1", methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41
+    assert len(height_table(REACH, methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41
+
+
+def test_the_rule_that_is_printed_and_applied_is_that_of_the_records():
+    rule = SuccessRule(position=0.02, orientation=np.radians(3.0), window=0.5, horizon=4.0)
+    frame = heights([1, 3, 1, 1])
+    methods = methods_in(FakeStore([FakeRun(record("ik", 0, frame, rule=rule), frame)]))
+    reach = reach_table(REACH, methods)
+    assert reach.rows[-1][4] == "10–15"  # 3 cm is not within 2 cm
+    for table in (reach, paper_table(ABLATION, methods), height_table(REACH, methods["ik"])):
+        text = " ".join(table.notes)
+        assert "final 0.5 s" in text and "1 s" not in text.replace("0.5 s", "") and "5 cm" not in text
+    assert "inside 2 cm and 3 deg" in " ".join(reach.notes)
+    assert "final 0.5 s of 4 s" in " ".join(paper_table(ABLATION, methods).notes)
+    assert "last 0.5 s" in " ".join(paper_table(ABLATION, methods, terminated=True).notes)
+    label = error_cdf(Figure().subplots(), methods_of(ABLATION, methods), "orientation_error").get_xlabel()
+    assert "final 0.5 s" in label
+    text = order_text(rule)
+    assert "final 0.5 s" in text and "2 cm" in text and "3°" in text

@@ -7,7 +7,9 @@ from synthetic import FakeRun, FakeStore, episodes, frame_of, methods_in, record
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.results import analysis
 from wbc_bench.results.figures import workspace
-from wbc_bench.results.study import ABLATION, methods_of
+from wbc_bench.results.study import find_study, methods_of
+
+ABLATION = find_study("ablation_v1")
 
 
 def method(frame) -> analysis.Evaluated:

@@ -1,8 +1,10 @@
 """What an evaluation leaves behind: the time series of a shard of episodes and how each ended."""
 
 import enum
+import math
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +24,18 @@ class Outcome(enum.StrEnum):
 
 
 TERMINATED = (Outcome.FELL, Outcome.ILLEGAL_CONTACT, Outcome.INVALID)
+
+
+class SuccessRule(msgspec.Struct, frozen=True):
+    """When an episode succeeds: both errors stay inside the tolerances throughout the final window.
+
+    The defaults are those of every committed record that was written before records had this field.
+    """
+
+    position: float = 0.05  # [m]
+    orientation: float = math.radians(7.0)  # [rad]
+    window: float = 1.0  # [s]
+    horizon: float = 10.0  # [s] of an episode that is not terminated
 
 
 @dataclass(frozen=True)

@@ -20,22 +20,36 @@ from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
 from wbc_bench.results.store import ResultStore
-from wbc_bench.results.study import ABLATION, Study
+from wbc_bench.results.study import Study, StudyError, released_studies, studies_of
 from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 
 
-def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[Path]:
+def publish(
+    store: ResultStore, out: Path, beside: Sequence[str] = (), studies: Sequence[Study] = ()
+) -> list[Path]:
     """Write <out>/tables, <out>/figures and <out>/report.html; equal records give equal bytes.
 
-    They are made in a folder of their own and moved when all of them are there. `beside` names the
-    controllers shown side by side over the workspace; the best two of each protocol otherwise.
+    They are made in a folder of their own and moved when all of them are there.
+
+    Args:
+        store: The records.
+        out: The folder that is written.
+        beside: Controllers shown side by side over the workspace; the best two of each protocol when empty.
+        studies: Studies besides the released ones; one of the same name takes the place of a released one.
 
     Raises:
-        StoreError: the store has no run, mixes digests, or the folder cannot be written.
-        UnknownNameError: a controller named has no run under any protocol.
+        StoreError: The store has no run, mixes digests, or the folder cannot be written.
+        StudyError: A study has the name of a protocol that is not its own.
+        UnknownNameError: A controller named has no run under any protocol.
     """
     evaluated = collect_all(store.runs())
+    known_studies = list({study.name: study for study in (*released_studies(), *studies)}.values())
+    for study in known_studies:
+        if study.name != study.protocol and study.name in evaluated:
+            raise StudyError(
+                f"study '{study.name}' of {study.protocol}: its name is that of another protocol with runs"
+            )
     tracks, doors = read_tracks(store.root), read_doors(store.root)
     if not evaluated and not tracks and not doors:
         raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
@@ -48,10 +62,10 @@ def publish(store: ResultStore, out: Path, beside: Sequence[str] = ()) -> list[P
         with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
             made = Path(folder)
             for protocol, methods in evaluated.items():
-                _write_protocol(protocol, methods, made, beside)
+                _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies))
             _write_tracks(tracks, made)
             _write_doors(doors, made)
-            report.write(evaluated, made, out)
+            report.write(evaluated, made, out, {study.name: study.protocol for study in known_studies})
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))
@@ -91,16 +105,18 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
     return pd.DataFrame({"target_x": x, "target_y": y, "height": height, "stratum": manifest.stratum})
 
 
-def _write_protocol(name: str, methods: Mapping[str, Evaluated], out: Path, beside: Sequence[str]) -> None:
+def _write_protocol(
+    name: str, methods: Mapping[str, Evaluated], out: Path, beside: Sequence[str], studies: Sequence[Study]
+) -> None:
     released = read_protocol(PROTOCOLS / f"{name}.toml") if name in protocol_names() else None
-    if released and isinstance(released.targets, ReachTargets):
-        write_reach_tables(name, methods, out / "tables")
-        write_reach_figures(name, methods, out / "figures")
-    else:
-        study = ABLATION if name == ABLATION.protocol else Study(name, ())
-        write_study_tables(study, methods, out / "tables")
-        write_study_figures(study, methods, out / "figures")
-        write_workspace(study, methods, out / "figures", [spec for spec in beside if spec in methods])
+    for study in studies:
+        if released and isinstance(released.targets, ReachTargets):
+            write_reach_tables(study, methods, out / "tables")
+            write_reach_figures(study, methods, out / "figures")
+        else:
+            write_study_tables(study, methods, out / "tables")
+            write_study_figures(study, methods, out / "figures")
+            write_workspace(study, methods, out / "figures", [spec for spec in beside if spec in methods])
     if released:
         manifest, _ = read_manifest(released, manifest_path(PROTOCOLS / f"{name}.toml"))
         write_targets(target_frame(manifest), name, out / "figures")

@@ -54,8 +54,10 @@ class _Evaluation:
 
 @dataclass(frozen=True)
 class Ablation(_Evaluation):
-    """Evaluate every method of the paper's study on the same episodes, and write its tables and figures."""
+    """Evaluate every controller of a study on the same episodes, and write its tables and figures."""
 
+    study: str = "ablation_v1"
+    """Name of a released study, or a .toml file: the controllers that share a table, and the pairs tested."""
     replicates: Replicates = None
     """Number of replicates of the protocol to evaluate; all of them when not given."""
     episodes: int | None = None
@@ -66,16 +68,16 @@ class Ablation(_Evaluation):
     def run(self) -> None:
         from wbc_bench.publish import publish
         from wbc_bench.results.analysis import collect
-        from wbc_bench.results.study import ABLATION, Row
+        from wbc_bench.results.study import find_study
         from wbc_bench.results.tables.pairs import pair_table
         from wbc_bench.results.tables.paper import paper_table
 
-        study = ABLATION
-        specs = self.controllers or tuple(Row(*row).spec for row in study.rows)
+        study = find_study(self.study)
+        specs = self.controllers or tuple(row.spec for row in study.rows)
         store = self._evaluate(
             study.protocol, specs, self.replicates, self.episodes, optional=not self.controllers
         )
-        publish(store, self.out)
+        publish(store, self.out, studies=[study])
         evaluated = collect(store.runs(study.protocol))
         print_table(paper_table(study, evaluated))
         pairs = pair_table(study, evaluated)
@@ -97,6 +99,7 @@ class Reach(_Evaluation):
         from wbc_bench.episodes.protocol import ReachTargets, find_protocol
         from wbc_bench.publish import publish
         from wbc_bench.results.analysis import collect
+        from wbc_bench.results.study import studies_of
         from wbc_bench.results.tables.reach import reach_table
 
         protocol, _ = find_protocol(self.protocol)
@@ -104,7 +107,8 @@ class Reach(_Evaluation):
             raise UsageError(f"--protocol {self.protocol}: its targets are not of type 'reach'")
         store = self._evaluate(self.protocol, self.controller, None, None)
         publish(store, self.out)
-        print_table(reach_table(protocol.name, collect(store.runs(protocol.name))))
+        study = studies_of(protocol.name)[0]
+        print_table(reach_table(study, collect(store.runs(protocol.name))))
         print(f"tables, figures and report.html are under {self.out}")
 
 
@@ -129,7 +133,8 @@ class Eval(_Evaluation):
         from wbc_bench.results.tables.strata import outcome_table
 
         store = self._evaluate(self.protocol, self.controller, self.replicates, self.episodes)
-        study = Study(find_protocol(self.protocol)[0].name, ())
+        name = find_protocol(self.protocol)[0].name
+        study = Study(name, name)
         evaluated = collect(store.runs(study.protocol))
         print_table(paper_table(study, evaluated))
         print_table(outcome_table(study, evaluated))

@@ -83,7 +83,9 @@ class Results:
 
     def table(self) -> Table:
         """Success, errors and action variation as in the tables of a report."""
-        return paper_table(Study(self.protocol.name, ()), {self.evaluated.spec: self.evaluated})
+        return paper_table(
+            Study(self.protocol.name, self.protocol.name), {self.evaluated.spec: self.evaluated}
+        )
 
     def __str__(self) -> str:
         return self.table().markdown()

@@ -1,4 +1,4 @@
-"""Runs that a store does not hold yet: the shards that are missing are computed, kept, and merged."""
+"""Runs that a store does not hold yet: the shards that are missing are computed, written, and merged."""
 
 import hashlib
 import sys
@@ -17,6 +17,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.shard import SHARD_EPISODES
 from wbc_bench.evaluation.workers import Engine, Result, Task, results
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.progress import Progress
 from wbc_bench.provenance import Software
 from wbc_bench.registry import build_controller, spec_of_replicate
@@ -38,10 +39,10 @@ class Job:
 
 
 def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, overwrite: bool = False) -> list[Run]:
-    """Evaluate what the store does not hold yet; finished shards of an interrupted evaluation are kept.
+    """Evaluate what the store does not hold yet; finished shards of an interrupted evaluation are reused.
 
     Raises:
-        StoreError: the store holds other answers under the same name, is in use or is full.
+        StoreError: the store holds a different evaluation under the same name, is in use or is full.
         ControllerError: a controller cannot be built or breaks the interface.
         ExecutionError: workers cannot be started or keep dying.
     """
@@ -146,6 +147,8 @@ class _Run:
         if self.writer.finished or self.writer.missing:
             return
         now, info = time.time(), self._controller.info
+        protocol = self.job.protocol
+        success, horizon = protocol.success, protocol.episodes.horizon
         self.writer.finish(
             {
                 "controller_name": info.name,
@@ -155,6 +158,7 @@ class _Run:
                 "checkpoint_sha256": getattr(self._controller, "checkpoint_sha256", None),
                 "wall_time_s": round(max(0.0, now - self._started), 3),  # 0 when only the merge was left
                 "created": datetime.fromtimestamp(now, UTC).isoformat(timespec="seconds"),
+                "rule": SuccessRule(success.position, success.orientation, success.window, horizon),
                 **shared,
             }
         )

@@ -33,4 +33,5 @@ def sample_latents(controller: Controller, protocol: EvalProtocol, rows: Episode
         time = np.full(ran.sum(), step * protocol.control_period)  # [s]
         parts.append((latent[ran], error[ran], rows.episode[ran], time))
         before = loop.state
-    return Samples(*map(np.concatenate, zip(*parts, strict=True)))
+    latent, error, episode, time = map(np.concatenate, zip(*parts, strict=True))
+    return Samples(latent, error, episode, time, precision_below=protocol.success.position)

@@ -3,11 +3,8 @@
 Pure functions of the episode records; no file is written here.
 """
 
-import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -15,15 +12,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wbc_bench.errors import StoreError
-from wbc_bench.outcomes import STRATA, TERMINATED
+from wbc_bench.outcomes import STRATA, TERMINATED, SuccessRule
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 PAPER_SIGNALS = frozenset({"proprioception", "ee_pose"})  # what the paper's policy may see (its Table I)
-# Reach: the protocol's tolerance (the paper's success rule) is the rule of `reached` too.
-REACH_TOLERANCE = 0.05  # [m]
-ANGLE_TOLERANCE = float(np.radians(7.0))  # [rad] the orientation's part of the paper's success rule
 END_ZONE = 0.10  # [m] "near an end" of the range: two steps of 5 cm to either side
 
 
@@ -64,6 +58,11 @@ class Evaluated:
         return sorted(set(self.records[0].signals) - PAPER_SIGNALS)
 
     @property
+    def rule(self) -> SuccessRule:
+        """The one of the protocol, whose digest all records share."""
+        return self.records[0].rule
+
+    @property
     def trained(self) -> bool:
         return any(record.checkpoint_sha256 for record in self.records)
 
@@ -75,7 +74,7 @@ class Evaluated:
 def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
     """Spec -> its runs, sorted by spec, of runs under one protocol; reads their episodes, so call it once.
 
-    Raises: StoreError when two runs answered different protocols or manifests under the same name.
+    Raises: StoreError when two runs under one name were evaluated with different protocols or manifests.
     """
     runs = sorted(runs, key=lambda run: (run.record.controller, run.record.replicate))
     first: dict[str, tuple[str, str]] = {}  # what must agree -> (value, the first run that said so)
@@ -115,6 +114,11 @@ def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
     return {protocol: collect(group) for protocol, group in grouped.items()}
 
 
+def rule_of(evaluated: Mapping[str, Evaluated]) -> SuccessRule:
+    """The success rule that the controllers of one protocol share."""
+    return next((method.rule for method in evaluated.values()), SuccessRule())
+
+
 def column(episodes: pd.DataFrame, name: str) -> FloatArray:
     """One numeric column, (N,)."""
     return np.asarray(episodes[name], dtype=np.float64)
@@ -142,25 +146,19 @@ def strata_of(episodes: pd.DataFrame) -> list[str]:
     return [s for s in (*STRATA, "beyond") if s in present] + sorted(present - {*STRATA, "beyond"})
 
 
-@cache
-def paper_values() -> dict[str, Any]:
-    text = Path(__file__).with_name("paper_values.toml").read_text(encoding="utf-8")
-    return tomllib.loads(text)
-
-
 class HeightRange(NamedTuple):
     low: float  # [m], NaN when nothing was reached
     high: float
     reached: int  # heights reached, also outside the longest run
 
 
-def reached(episodes: pd.DataFrame) -> bool:
-    """Whether the median error over the episodes of one height is below the tolerance.
+def reached(episodes: pd.DataFrame, rule: SuccessRule) -> bool:
+    """Whether the median error over the episodes of one height is below the tolerance of success.
 
     A terminated episode, or one without a value, counts as infinitely far; so more than half must have stood.
     """
     error = column(episodes, "position_error")
-    return bool(np.median(np.where(stood(episodes) & ~np.isnan(error), error, np.inf)) < REACH_TOLERANCE)
+    return bool(np.median(np.where(stood(episodes) & ~np.isnan(error), error, np.inf)) < rule.position)
 
 
 def by_height(episodes: pd.DataFrame) -> list[tuple[float, pd.DataFrame]]:
@@ -185,10 +183,10 @@ def contiguous_range(heights: Sequence[float], good: Sequence[bool]) -> HeightRa
     return HeightRange(heights[best[0]], heights[best[1] - 1], int(sum(good)))
 
 
-def reach_range(episodes: pd.DataFrame, strict: bool = False) -> HeightRange:
+def reach_range(episodes: pd.DataFrame, rule: SuccessRule, strict: bool = False) -> HeightRange:
     """Range of heights reached; strict asks that more than half of a height's episodes succeed."""
     groups = by_height(episodes)
-    good = [column(g, "success").mean() > 0.5 if strict else reached(g) for _, g in groups]
+    good = [column(g, "success").mean() > 0.5 if strict else reached(g, rule) for _, g in groups]
     return contiguous_range([height for height, _ in groups], good)
 
 

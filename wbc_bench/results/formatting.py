@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import stats
 
 CM = 100.0  # [cm/m]
@@ -24,6 +25,14 @@ def interval_text(value: stats.Estimate, scale: float, digits: int, sign: str = 
 
 def p_value_text(p: float) -> str:
     return NONE if np.isnan(p) else "<0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def tolerance_text(rule: SuccessRule) -> str:
+    return f"{rule.position * CM:g} cm and {rule.orientation * DEG:g} deg"
+
+
+def window_text(rule: SuccessRule) -> str:
+    return f"final {rule.window:g} s"
 
 
 def number_text(value: float, digits: int) -> str:

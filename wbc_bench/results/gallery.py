@@ -7,40 +7,43 @@ import numpy as np
 import pandas as pd
 
 from wbc_bench.files import folder_name
-from wbc_bench.outcomes import TERMINATED, Outcome
+from wbc_bench.outcomes import TERMINATED, Outcome, SuccessRule
 from wbc_bench.results.analysis import (
-    ANGLE_TOLERANCE,
-    REACH_TOLERANCE,
     Evaluated,
     FloatArray,
     column,
     subset,
 )
-from wbc_bench.results.formatting import CM, DEG, number_text
+from wbc_bench.results.formatting import CM, DEG, number_text, window_text
 
 SHOWN = 10  # episodes an outcome
-RULE = (
-    f"At most {SHOWN} episodes of each outcome, the worst first. Of episodes that terminated, the worst "
-    "ended first; of the others, it has the largest error over the final 1 s: the position's in units of "
-    f"{REACH_TOLERANCE * CM:.0f} cm or the orientation's in units of {ANGLE_TOLERANCE * DEG:.0f}°, whichever "
-    "is more. Equals come in the order of replicate and episode. Run a command in the folder of this report; "
-    "the page it writes is linked here by the next `wbc-bench report`."
-)
 
 
-def badness(episodes: pd.DataFrame, outcome: Outcome) -> FloatArray:
-    """How bad each episode of one outcome is, (N,), by RULE; an undefined error counts as the worst."""
+def order_text(rule: SuccessRule) -> str:
+    """Which episodes are shown, in words."""
+    return (
+        f"At most {SHOWN} episodes of each outcome, the worst first. Of episodes that terminated, the worst "
+        f"ended first; of the others, it has the largest error over the {window_text(rule)}: the position's "
+        f"in units of {rule.position * CM:g} cm or the orientation's in units of "
+        f"{rule.orientation * DEG:g}°, whichever is more. Equals come in the order of replicate and episode. "
+        "Run a command in the folder of this report; the page it writes is linked here by the next "
+        "`wbc-bench report`."
+    )
+
+
+def badness(episodes: pd.DataFrame, outcome: Outcome, rule: SuccessRule) -> FloatArray:
+    """How bad each episode of one outcome is, (N,), see `order_text`; an undefined error is the worst."""
     if outcome in TERMINATED:
         return -np.nan_to_num(column(episodes, "duration"), nan=0.0)  # NaN: ended before its first step
-    position = column(episodes, "position_error") / REACH_TOLERANCE
-    orientation = column(episodes, "orientation_error") / ANGLE_TOLERANCE
+    position = column(episodes, "position_error") / rule.position
+    orientation = column(episodes, "orientation_error") / rule.orientation
     return np.nan_to_num(np.maximum(position, orientation), nan=np.inf)
 
 
-def worst(episodes: pd.DataFrame, outcome: Outcome, count: int = SHOWN) -> pd.DataFrame:
+def worst(episodes: pd.DataFrame, outcome: Outcome, rule: SuccessRule, count: int = SHOWN) -> pd.DataFrame:
     """The worst episodes of an outcome, worst first."""
     chosen = subset(episodes, np.asarray(episodes["outcome"] == str(outcome), dtype=bool))
-    order = np.lexsort((chosen["episode"], chosen["replicate"], -badness(chosen, outcome)))
+    order = np.lexsort((chosen["episode"], chosen["replicate"], -badness(chosen, outcome, rule)))
     return chosen.take(order[:count])
 
 
@@ -65,7 +68,7 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
     outcomes = np.asarray(episodes["outcome"], dtype=str)
     rows = []
     for outcome in (*(each for each in Outcome if each != Outcome.SUCCESS), Outcome.SUCCESS):
-        for k, row in enumerate(worst(episodes, outcome).to_dict("records")):
+        for k, row in enumerate(worst(episodes, outcome, method.rule).to_dict("records")):
             where = (protocol, method.spec, int(row["replicate"]), int(row["episode"]))
             count = int((outcomes == str(outcome)).sum())
             name = f"{str(outcome).replace('_', ' ')} ({count})" if k == 0 else ""

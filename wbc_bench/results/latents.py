@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.errors import BenchError
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import stats
-from wbc_bench.results.analysis import REACH_TOLERANCE, FloatArray
+from wbc_bench.results.analysis import FloatArray
 
 IntArray = NDArray[np.int64]
 
 PHASES = ("precision", "approach", "locomotion")  # by growing error
-PRECISION_BELOW = REACH_TOLERANCE  # [m] Source: paper, section IV-B, the success rule
 # d = 2 e_p + e_R is at the centre of the gate, mu = 1, where e_p = 0.5 m and e_R = 0: beyond, the reward asks
 # for locomotion. Source: paper, eq. rfm_phase; mu of SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
 LOCOMOTION_ABOVE = 0.5  # [m]
@@ -34,6 +34,12 @@ class Samples(NamedTuple):
     error: FloatArray  # (M,) [m] position of the end-effector off its target
     episode: IntArray  # (M,) number of the episode
     time: FloatArray  # (M,) [s] since its start
+    precision_below: float = SuccessRule().position  # [m] tolerance of the protocol's success rule
+
+    @property
+    def phase(self) -> IntArray:
+        """Index into PHASES, (M,)."""
+        return phase_of(self.error, self.precision_below)
 
 
 class Separation(NamedTuple):
@@ -49,9 +55,9 @@ class Separation(NamedTuple):
     axes: FloatArray  # (M, P - 1) projection
 
 
-def phase_of(error: FloatArray) -> IntArray:
-    """Index into PHASES, (M,), of position errors [m]."""
-    return np.digitize(error, [PRECISION_BELOW, LOCOMOTION_ABOVE])
+def phase_of(error: FloatArray, precision_below: float) -> IntArray:
+    """Index into PHASES, (M,), of position errors (M,) [m]."""
+    return np.digitize(error, [precision_below, LOCOMOTION_ABOVE])
 
 
 def held_out(episode: IntArray, rng: np.random.Generator) -> NDArray[np.bool_]:
@@ -74,7 +80,7 @@ def separate(samples: Samples, rng: np.random.Generator) -> Separation:
         raise LatentError(f"{count} episodes: valid: {LEAST_EPISODES} or more, half of them are held out")
     if not np.isfinite(samples.latent).all() or not np.ptp(samples.latent, axis=0).any():
         raise LatentError("the latent is not finite or never changes: there is nothing to project")
-    phase, tested = phase_of(samples.error), held_out(samples.episode, rng)
+    phase, tested = samples.phase, held_out(samples.episode, rng)
     kinds = np.unique(phase[~tested])
     if len(kinds) < 2:
         raise LatentError(

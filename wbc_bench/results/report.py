@@ -13,8 +13,10 @@ from typing import Any
 import msgspec
 
 from wbc_bench.errors import StoreError
+from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import gallery
-from wbc_bench.results.analysis import Evaluated
+from wbc_bench.results.analysis import Evaluated, rule_of
+from wbc_bench.results.formatting import window_text
 from wbc_bench.results.table import code_html, read_markdown
 
 CSS = """
@@ -58,17 +60,17 @@ GIVEN_SECTIONS = (
     ("latent_", "Latent spaces"),
     ("learning_curves", "Learning curves"),
 )
-CAPTIONS = {  # end of a figure's name -> what it shows
+CAPTIONS = {  # end of a figure's name -> what it shows; {window} is that of the success rule
     "_success": "Success by stratum of the targets.",
     "_outcomes": "How the episodes ended.",
-    "_errors": "Share of all episodes that stood with an error up to x, in the final second.",
+    "_errors": "Share of all episodes that stood with an error up to x, in the {window}.",
     "_workspace": "Targets, and where they are reached: success over bins of target positions, "
     "projected on the vertical plane and on the ground. Faint bins hold few episodes, blank ones none.",
     "_targets": "Targets of the protocol by stratum, from the side and from above.",
     "tracking": "Error of the hand over time while its target moves.",
 }
 REACH_CAPTION = (
-    "Straight ahead over height: the range reached, success, and in the final second the position error and "
+    "Straight ahead over height: the range reached, success, and in the {window} the position error and "
     "how the hand oscillates, as speed and as smoothness (spectral arc length, 0 is smoothest)."
 )
 
@@ -149,11 +151,12 @@ def write(
     evaluated: Mapping[str, Mapping[str, Evaluated]],
     results_dir: Path | str,
     beside: Path | str | None = None,
+    studies: Mapping[str, str] | None = None,
 ) -> Path:
     """Writes <results_dir>/report.html from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
-    will stand; `results_dir` when not given.
+    will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol.
 
     Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
     """
@@ -165,24 +168,26 @@ def write(
     records = [
         record for methods in evaluated.values() for method in methods.values() for record in method.records
     ]
-    # A section per protocol: its files begin with its name, and the longest such name owns a file.
+    # A section per protocol: its files begin with its name or a study's; the longest such name owns a file.
     protocols = list(evaluated)
-
     parts_of_report = [*protocols, "tracking", "doors"]
+    section_of = {name: of for name, of in (studies or {}).items() if of in protocols}
+    section_of |= {name: name for name in parts_of_report}
 
     def owner(stem: str) -> str:
-        return max((p for p in parts_of_report if stem == p or stem.startswith(f"{p}_")), key=len, default="")
+        names = (name for name in section_of if stem == name or stem.startswith(f"{name}_"))
+        return section_of.get(max(names, key=len, default=""), "")
 
     sections = []
     for protocol in [*parts_of_report, ""]:
+        rule = rule_of(evaluated.get(protocol, {}))
         own = sorted((path for path in tables if owner(path.stem) == protocol), key=_order)
         shown = [read_markdown(path).html() for path in own]
-        images = [
-            figure_html(_figure(root, stem), _caption(stem)) for stem in figures if owner(stem) == protocol
-        ]
+        stems = (stem for stem in figures if owner(stem) == protocol)
+        images = [figure_html(_figure(root, stem), _caption(stem, rule)) for stem in stems]
         parts = [*shown[:1], *images, *shown[1:]]  # what most readers came for, first
         if protocol in protocols:
-            parts.append(f'<p class="rule">{code_html(gallery.RULE)}</p>\n')
+            parts.append(f'<p class="rule">{code_html(gallery.order_text(rule))}</p>\n')
             methods = evaluated[protocol].values()
             parts += [gallery.gallery_html(protocol, method, beside) for method in methods]
         if parts:
@@ -232,9 +237,9 @@ def _is_given(stem: str) -> bool:
     return any(stem.startswith(prefix) for prefix, _ in GIVEN_SECTIONS)
 
 
-def _caption(stem: str) -> str:
+def _caption(stem: str, rule: SuccessRule) -> str:
     found = [caption for end, caption in CAPTIONS.items() if stem.endswith(end)]
-    return found[0] if found else REACH_CAPTION
+    return (found[0] if found else REACH_CAPTION).format(window=window_text(rule))
 
 
 def _figure(root: Path, stem: str) -> Path:

@@ -1,4 +1,4 @@
-"""The results folder: one run record and one file of episodes a run, written atomically, shard by shard.
+"""The results folder: one record and one file of episodes per run, written atomically, shard by shard.
 
     <root>/runs/<protocol>/<controller>/replicate_<k>/run.json, episodes.parquet
                                                       shards/shard_00000.parquet ... while it runs
@@ -23,13 +23,24 @@ import pyarrow.parquet as pq
 
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import folder_name, write_atomic
-from wbc_bench.outcomes import Outcome
+from wbc_bench.outcomes import Outcome, SuccessRule
 
+DIFFERS = {  # field of a key -> what it is, in words
+    "protocol": "protocol",
+    "protocol_digest": "version of the protocol",
+    "manifest_sha256": "manifest",
+    "controller": "controller",
+    "replicate": "replicate",
+    "requested": "number of episodes",
+    "shard_episodes": "size of shards",
+    "software_sha256": "version of the software",
+    "controller_sha256": "version of the controller or its files",
+}
 LABELS = ("stratum", "condition", "orientation", "outcome")  # few values: dictionary-encoded
 
 
 class RunKey(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is an answer to. Shards of different keys must not be merged."""
+    """What identifies a run. Shards of different keys must not be merged."""
 
     protocol: str
     protocol_digest: str
@@ -73,6 +84,8 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     compute_time_s: float  # [s] summed over shards
     max_rss_mib: float  # [MiB] largest resident set of any worker
     created: str  # UTC, ISO 8601
+    # A record without the field was made under the v1 protocols, whose rule the defaults are.
+    rule: SuccessRule = SuccessRule()
 
 
 class ShardCost(NamedTuple):
@@ -118,7 +131,13 @@ class Run:
                 f"'{path}' is not what its run.json was written for: sha256 {sha256[:16]}..., "
                 f"recorded {self.record.episodes_sha256[:16]}..."
             )
-        return pq.read_table(pa.BufferReader(data)).replace_schema_metadata()
+        table = pq.read_table(pa.BufferReader(data))
+        written = table.schema.metadata or {}
+        for name, value in _identity(self.record).items():
+            found = written.get(name.encode(), b"").decode()
+            if found != value:
+                raise StoreError(f"'{path}' was written for {name} '{found}', its run.json says '{value}'")
+        return table.replace_schema_metadata()
 
 
 class ResultStore:
@@ -128,16 +147,24 @@ class ResultStore:
         self.root = Path(root)
 
     def runs(self, protocol: str | None = None) -> list[Run]:
-        """Finished runs, sorted by folder, i.e. protocol, controller, replicate."""
+        """Finished runs, sorted by folder, i.e. protocol, controller, replicate.
+
+        Raises:
+            StoreError: A record cannot be read, or stands in a folder of another name: a copied folder would
+                count its episodes twice.
+        """
         pattern = f"runs/{'*' if protocol is None else folder_name(protocol)}/*/replicate_*/run.json"
-        return [Run(path.parent, _read_record(path)) for path in sorted(self.root.glob(pattern))]
+        runs = [Run(path.parent, _read_record(path)) for path in sorted(self.root.glob(pattern))]
+        for run in runs:
+            _check_folder(run)
+        return runs
 
     def load(self, protocol: str, controller: str) -> pd.DataFrame:
         """Episodes of all replicates of a controller.
 
         Raises:
             UnknownNameError: it has no run.
-            StoreError: its replicates answer different protocols or manifests.
+            StoreError: its replicates were evaluated with different protocols or manifests.
         """
         runs = [run for run in self.runs(protocol) if run.record.controller == controller]
         if not runs:
@@ -187,9 +214,10 @@ class RunWriter:
     """
 
     def __init__(self, store: ResultStore, key: RunKey, overwrite: bool = False) -> None:
-        """Raises: StoreError when the folder is in use, or holds other episodes and `overwrite` is False.
+        """Open or create the folder of a run; `overwrite` replaces an earlier one once this one is whole.
 
-        With `overwrite` an earlier run is replaced when the new one is whole, and not before.
+        Raises:
+            StoreError: The folder is in use, or holds a run of another key and `overwrite` is False.
         """
         self.key = key
         self.path = store.run_path(key.protocol, key.controller, key.replicate)
@@ -205,7 +233,7 @@ class RunWriter:
                 self._drop_shards()  # it may have been killed between the record and the clean-up
                 self.done: dict[int, ShardCost] = {}
             else:
-                self.done = self._kept_shards(overwrite)
+                self.done = self._whole_shards(overwrite)
         except BaseException:
             self.close()
             raise
@@ -240,8 +268,7 @@ class RunWriter:
         tables = [_read_table(self._shard_path(k)) for k in range(self.num_shards)]
         episodes = pa.concat_tables([table.replace_schema_metadata() for table in tables]).combine_chunks()
         key = self.key
-        identity = {name: str(getattr(key, name)) for name in ("protocol", "protocol_digest", "controller")}
-        data = _parquet(episodes, {**identity, "replicate": str(key.replicate)})
+        data = _parquet(episodes, _identity(key))
         outcomes = episodes["outcome"].to_pylist()
         record = RunRecord(
             **msgspec.structs.asdict(key),
@@ -307,12 +334,12 @@ class RunWriter:
                 cost = ShardCost(round(record.compute_time_s * share, 3), record.max_rss_mib)
                 self._write(shard, episodes.slice(rows.start, len(rows)), cost)
 
-    def _kept_shards(self, overwrite: bool) -> dict[int, ShardCost]:
+    def _whole_shards(self, overwrite: bool) -> dict[int, ShardCost]:
         """Whole shards of an earlier session; a damaged one is moved aside and computed again.
 
         With `overwrite` those of another key are not refused but computed again.
         """
-        kept = {}
+        whole = {}
         for shard in range(self.num_shards):
             path = self._shard_path(shard)
             if not path.exists():
@@ -329,16 +356,16 @@ class RunWriter:
                 continue
             self._refuse_mixing(key, path, ignore={"requested"})
             if len(table) == len(self.rows(shard)):
-                kept[shard] = cost
-        return kept
+                whole[shard] = cost
+        return whole
 
     def _refuse_mixing(self, other: RunKey | RunRecord, path: Path, ignore: Collection[str] = ()) -> None:
         for name in self.key.__struct_fields__:
             here, there = getattr(self.key, name), getattr(other, name)
             if name not in ignore and here != there:
                 raise StoreError(
-                    f"'{path}' was evaluated with another {name}: {there}, asked for {here}; "
-                    "give another --out, or --overwrite to evaluate it again"
+                    f"'{path}' was evaluated with a different {DIFFERS[name]}: {name} is {there}, asked for "
+                    f"{here}; give another --out, or --overwrite to evaluate it again"
                 )
 
     def _drop_shards(self) -> None:
@@ -359,6 +386,22 @@ def _parquet(table: pa.Table, facts: Mapping[str, str | bytes], checksum: bool =
         write_page_checksum=checksum,
     )
     return sink.getvalue().to_pybytes()
+
+
+def _identity(of: RunKey | RunRecord) -> dict[str, str]:
+    """Which run a file of episodes belongs to, as its metadata say."""
+    names = ("protocol", "protocol_digest", "controller", "replicate")
+    return {name: str(getattr(of, name)) for name in names}
+
+
+def _check_folder(run: Run) -> None:
+    record = run.record
+    expected = (folder_name(record.protocol), folder_name(record.controller), f"replicate_{record.replicate}")
+    if run.path.parts[-3:] != expected:
+        raise StoreError(
+            f"'{run.path}' holds the run of {'/'.join(expected)}: is the folder a copy? "
+            "remove it or give it its own name back"
+        )
 
 
 def _read_record(path: Path) -> RunRecord:

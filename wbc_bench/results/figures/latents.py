@@ -15,12 +15,10 @@ from wbc_bench.results.formatting import CM
 from wbc_bench.results.latents import (
     LOCOMOTION_ABOVE,
     PHASES,
-    PRECISION_BELOW,
     IntArray,
     Samples,
     Separation,
     _sklearn,
-    phase_of,
     separate,
 )
 
@@ -68,7 +66,7 @@ def summary(samples: Samples, found: Separation) -> list[str]:
         f"tested on {accuracy.num_episodes}; {samples.latent.shape[1]} columns",
         "",
         "phase by position error",
-        f"  precision below {PRECISION_BELOW * CM:.0f} cm",
+        f"  precision below {samples.precision_below * CM:g} cm",
         "  approach between",
         f"  locomotion from {LOCOMOTION_ABOVE * CM:.0f} cm",
     ]
@@ -76,7 +74,7 @@ def summary(samples: Samples, found: Separation) -> list[str]:
 
 def latent_figure(name: str, samples: Samples, found: Separation, seed: int) -> Figure:
     """t-SNE of all episodes, LDA of the held-out ones, and the numbers beside them."""
-    rng, phase = np.random.default_rng(seed), phase_of(samples.error)
+    rng, phase = np.random.default_rng(seed), samples.phase
     all_of_them = draw_sample(np.arange(len(phase)), rng)
     unseen = draw_sample(
         np.flatnonzero(found.held_out & np.isin(phase, [PHASES.index(p) for p in found.phases])), rng
@@ -117,7 +115,7 @@ def write_latents(
     episodes = found.train_episodes + accuracy.num_episodes
     caption = (
         f"Latent of {spec} on {protocol}, {episodes} episodes, coloured by the phase of the task: precision "
-        f"below {PRECISION_BELOW * CM:.0f} cm of position error, locomotion from "
+        f"below {samples.precision_below * CM:g} cm of position error, locomotion from "
         f"{LOCOMOTION_ABOVE * CM:.0f} cm, approach between. A linear discriminant names "
         f"{_percent(accuracy)} of the steps of held-out episodes right, phases weighing alike; "
         f"chance is {100 * found.chance:.0f} %."
@@ -127,7 +125,7 @@ def write_latents(
         **{"columns": samples.latent.shape[1], "samples": len(samples.error)},
         **{"train_episodes": found.train_episodes, "held_out_episodes": accuracy.num_episodes},
         **{"balanced_accuracy": accuracy.point, "low": accuracy.low, "high": accuracy.high},
-        **{"chance": found.chance, "thresholds_m": [PRECISION_BELOW, LOCOMOTION_ABOVE]},
+        **{"chance": found.chance, "thresholds_m": [samples.precision_below, LOCOMOTION_ABOVE]},
         "recall": {
             p: None if np.isnan(r) else r for p, r in zip(found.phases, found.recall.tolist(), strict=True)
         },

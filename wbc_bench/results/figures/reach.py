@@ -13,11 +13,9 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator
 from wbc_bench.files import folder_name
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import (
-    REACH_TOLERANCE,
     Evaluated,
     by_height,
     column,
-    paper_values,
     reach_range,
     stood,
     strata_of,
@@ -25,6 +23,7 @@ from wbc_bench.results.analysis import (
 )
 from wbc_bench.results.figures.style import CONDITION_COLOURS, GREEN, GREY, SHADE, save, styled
 from wbc_bench.results.formatting import CM
+from wbc_bench.results.study import Study
 
 
 def reach_success(ax: Axes, episodes: pd.DataFrame, label: str, colour: str) -> Axes:
@@ -80,9 +79,9 @@ def reach_bars(ax: Axes, ranges: Sequence[tuple[str, float, float, str]]) -> Axe
     return ax
 
 
-def _paper_ranges() -> list[tuple[str, float, float, str]]:
-    block = paper_values()["reach"]
-    return [(f"{k} (paper)", float(v[0]), float(v[1]), GREY) for k, v in block.items() if k != "source"]
+def _paper_ranges(study: Study) -> list[tuple[str, float, float, str]]:
+    ranges = study.paper.ranges_cm if study.paper else {}
+    return [(f"{label} (paper)", low, high, GREY) for label, (low, high) in ranges.items()]
 
 
 def _shade_beyond(ax: Axes, episodes: pd.DataFrame) -> None:
@@ -96,7 +95,7 @@ def _shade_beyond(ax: Axes, episodes: pd.DataFrame) -> None:
             ax.axvspan(height * CM - step / 2, height * CM + step / 2, color=SHADE, lw=0, zorder=0)
 
 
-def reach_figure(protocol: str, method: Evaluated) -> Figure:
+def reach_figure(study: Study, method: Evaluated) -> Figure:
     """A column a gripper orientation: range, success, error, sway over height; a colour a condition."""
     parts = variants(method.episodes)
     orientations = sorted({orientation for _, orientation, _ in parts})
@@ -106,10 +105,10 @@ def reach_figure(protocol: str, method: Evaluated) -> Figure:
     )
     for ax_column, orientation in zip(axes.T, orientations, strict=True):
         ranges, success, error, speed, smoothness = ax_column
-        bars = _paper_ranges()
+        bars = _paper_ranges(study)
         for condition, episodes in ((c, e) for c, o, e in parts if o == orientation):
             colour = CONDITION_COLOURS.get(condition, GREEN)
-            span = reach_range(episodes)
+            span = reach_range(episodes, method.rule)
             bars.append((condition, span.low * CM, span.high * CM, colour))
             reach_success(success, episodes, condition, colour)
             reach_metric(error, episodes, "position_error", condition, colour, 0.95, CM)
@@ -118,7 +117,7 @@ def reach_figure(protocol: str, method: Evaluated) -> Figure:
             for ax in ax_column[1:]:
                 _shade_beyond(ax, episodes)
         reach_bars(ranges, bars).set_title(f"Gripper {orientation}: range reached (cm)")
-        error.axhline(REACH_TOLERANCE * CM, color=GREY, lw=0.9, ls="--")
+        error.axhline(method.rule.position * CM, color=GREY, lw=0.9, ls="--")
         smoothness.set_xlabel("Target height (cm)")
         smoothness.xaxis.set_major_locator(MultipleLocator(25))
         smoothness.set_xlim(-3, 203)
@@ -146,10 +145,10 @@ def reach_figure(protocol: str, method: Evaluated) -> Figure:
     return figure
 
 
-def write_reach_figures(protocol: str, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
+def write_reach_figures(study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
     """One figure a controller, straight into `out_dir`."""
     paths = []
     with styled():
         for spec, method in evaluated.items():
-            paths += save(reach_figure(protocol, method), f"{protocol}_{folder_name(spec)}", out_dir)
+            paths += save(reach_figure(study, method), f"{study.name}_{folder_name(spec)}", out_dir)
     return paths

@@ -15,10 +15,9 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 from wbc_bench.outcomes import Outcome
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import (
-    ANGLE_TOLERANCE,
-    REACH_TOLERANCE,
     Evaluated,
     column,
+    rule_of,
     strata_of,
     subset,
 )
@@ -31,7 +30,7 @@ from wbc_bench.results.figures.style import (
     save,
     styled,
 )
-from wbc_bench.results.formatting import CM, DEG
+from wbc_bench.results.formatting import CM, DEG, window_text
 from wbc_bench.results.study import Study, methods_of
 
 
@@ -79,9 +78,10 @@ def outcome_bars(ax: Axes, methods: Sequence[tuple[str, Evaluated]]) -> Axes:
 
 def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -> Axes:
     """Share of all episodes [%] that stood with an error up to x; what is missing to 100 % terminated."""
+    rule = rule_of({method.spec: method for _, method in methods})
     scale, unit, tolerance = {
-        "position_error": (CM, "cm", REACH_TOLERANCE * CM),
-        "orientation_error": (DEG, "deg", ANGLE_TOLERANCE * DEG),
+        "position_error": (CM, "cm", rule.position * CM),
+        "orientation_error": (DEG, "deg", rule.orientation * DEG),
     }[metric]
     ticks, (left, right) = (0.5, 1, 2, 5, 10, 20, 50, 100), (0.3, 200.0)
     for k, (label, method) in enumerate(methods):
@@ -100,10 +100,10 @@ def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -
             zorder=2.0 + 0.1 * (k % len(DASHES)),  # dashes above solid lines
         )
     ax.axvline(tolerance, color=GREY, lw=0.9, ls="--")
-    ax.text(tolerance * 0.94, 101, f"{tolerance:.0f} {unit}", ha="right", va="top", color=GREY, fontsize=8)
+    ax.text(tolerance * 0.94, 101, f"{tolerance:g} {unit}", ha="right", va="top", color=GREY, fontsize=8)
     ax.set_xscale("log")
     ax.set(xlim=(left, right), ylim=(0, 102), ylabel="All episodes (%)")
-    ax.set_xlabel(f"{metric.split('_')[0].capitalize()} error, mean of the final 1 s ({unit})")
+    ax.set_xlabel(f"{metric.split('_')[0].capitalize()} error, mean of the {window_text(rule)} ({unit})")
     ax.xaxis.set_major_locator(FixedLocator(ticks))
     ax.xaxis.set_minor_locator(FixedLocator([]))
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
@@ -129,17 +129,17 @@ def write_study_figures(study: Study, evaluated: Mapping[str, Evaluated], out_di
         figure = Figure(figsize=(6.4, 1.2 + 0.85 * len(methods)))
         ax = success_by_stratum(figure.subplots(), methods)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        paths += save(figure, f"{study.protocol}_success", out_dir)
+        paths += save(figure, f"{study.name}_success", out_dir)
 
         figure = Figure(figsize=(7.2, 1.3 + 0.5 * len(methods)))
         ax = outcome_bars(figure.subplots(), methods)
         figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        paths += save(figure, f"{study.protocol}_outcomes", out_dir)
+        paths += save(figure, f"{study.name}_outcomes", out_dir)
 
         figure = Figure(figsize=(7.6, 3.5))
         left, right = figure.subplots(1, 2, sharey=True)
         error_cdf(left, methods, "position_error").set_title("Position")
         error_cdf(right, methods, "orientation_error").set(title="Orientation", ylabel="")
         figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        paths += save(figure, f"{study.protocol}_errors", out_dir)
+        paths += save(figure, f"{study.name}_errors", out_dir)
     return paths

@@ -108,7 +108,7 @@ def chosen(methods: Sequence[tuple[str, Evaluated]], specs: Sequence[str]) -> li
 def write_workspace(
     study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str, specs: Sequence[str] = ()
 ) -> list[Path]:
-    """Targets, and beside them success of some controllers (default: the best two), as <protocol>_workspace.
+    """Targets, and beside them success of some controllers (default: the best two), as <study>_workspace.
 
     Raises: UnknownNameError, a controller named has no run.
     """
@@ -152,9 +152,9 @@ def write_workspace(
         colours = ScalarMappable(Normalize(0.0, 100.0), "viridis")  # without the opacities of a mesh
         figure.colorbar(colours, ax=axes[:, 1:], label=rates, aspect=60, **bar)
         figure.suptitle(
-            f"{study.protocol}: success over the workspace (+ start of the base)",
+            f"{study.name}: success over the workspace (+ start of the base)",
             x=0.01,
             ha="left",
             weight="bold",
         )
-        return save(figure, f"{study.protocol}_workspace", out_dir)
+        return save(figure, f"{study.name}_workspace", out_dir)

@@ -117,8 +117,8 @@ def pair_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
         for a, b in pairs
         if a in evaluated and b in evaluated
     ]
-    title = f"{study.protocol}: pairs of methods on the same episodes"
-    return _compare_table(f"{study.protocol}_pairs", title, "A vs B", _compare_rows(known))
+    title = f"{study.name}: pairs of methods on the same episodes"
+    return _compare_table(f"{study.name}_pairs", title, "A vs B", _compare_rows(known))
 
 
 def compare_table(protocol: str, evaluated: Mapping[str, Evaluated], a: str, b: str) -> Table:

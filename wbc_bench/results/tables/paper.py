@@ -13,7 +13,7 @@ from wbc_bench.results import stats
 from wbc_bench.results.analysis import (
     Evaluated,
     Mask,
-    paper_values,
+    rule_of,
     subset,
 )
 from wbc_bench.results.analysis import column as series
@@ -22,15 +22,17 @@ from wbc_bench.results.formatting import (
     DEG,
     NONE,
     spread_text,
+    tolerance_text,
+    window_text,
 )
-from wbc_bench.results.study import Study, study_rows
+from wbc_bench.results.study import Paper, Study, study_rows
 from wbc_bench.results.table import Table
 
 
 class Column(NamedTuple):
     """A column of the paper's Table III."""
 
-    name: str  # as in paper_values.toml
+    name: str  # as in a study file
     header: str
     metric: str
     quantile: float | None  # None is the mean
@@ -80,13 +82,14 @@ def columns_over_replicates(
     return result
 
 
-def paper_columns(spec: str) -> dict[str, stats.Spread] | None:
-    """The paper's own row for a method, or None where it prints none."""
-    block = paper_values()["ablation"]
-    if spec not in block["mean"]:
+def paper_columns(paper: Paper | None, spec: str) -> dict[str, stats.Spread] | None:
+    """The paper's own row for a method, or None where it prints none; a column it lacks is NaN."""
+    if paper is None or spec not in paper.mean:
         return None
-    cells = zip(block["columns"], block["mean"][spec], block["sd"][spec], strict=True)
-    return {name: stats.Spread(mean, sd, 3) for name, mean, sd in cells}
+    nothing = stats.Spread(np.nan, np.nan, 0)
+    cells = zip(paper.columns, paper.mean[spec], paper.sd[spec], strict=True)
+    printed = {name: stats.Spread(mean, sd, paper.seeds) for name, mean, sd in cells}
+    return {column.name: printed.get(column.name, nothing) for column in COLUMNS}
 
 
 def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bool = False) -> Table:
@@ -114,21 +117,23 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
             counts = {"completed": method.completed, "requested": method.requested, "errors_over": count}
             counts["replicates"] = len(method.records)
             data.append({**base, "source": "measured", "note": "", **counts, **_flat(values)})
-        printed = None if terminated else paper_columns(row.spec)
-        if printed:
+        printed = None if terminated else paper_columns(study.paper, row.spec)
+        if printed and study.paper:
+            episodes = study.paper.seeds * study.paper.episodes
             cells = (spread_text(printed[column.name], column.digits) for column in COLUMNS)
-            rows.append(("", "(paper)", "3000/3000", NONE, *cells))
+            rows.append(("", "(paper)", f"{episodes}/{episodes}" if episodes else NONE, NONE, *cells))
             data.append({**base, "source": "paper", "note": "", **_flat(printed)})
     header = ("Study", "Method", "Episodes", "Errors over", *(column.header for column in COLUMNS))
+    rule = rule_of(evaluated)
     if terminated:
-        name, title = f"{study.protocol}_all", f"{study.protocol}: errors over all episodes"
+        name, title = f"{study.name}_all", f"{study.name}: errors over all episodes"
         notes = [
             "As the table before, with the episodes that terminated: their error is the mean over the last "
-            "1 s before the end, and an episode that ended before its first step has none."
+            f"{rule.window:g} s before the end, and an episode that ended before its first step has none."
         ]
     else:
-        name, title = study.protocol, f"{study.protocol}: errors over episodes that did not terminate"
-        notes = _paper_notes(evaluated)
+        name, title = study.name, f"{study.name}: errors over episodes that did not terminate"
+        notes = _paper_notes(study, evaluated)
     if marks:
         notes.append(
             "† reads more than the paper's policy: " + "; ".join(f"{m}: {s}" for m, s in marks.items()) + "."
@@ -160,23 +165,25 @@ def _integers(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.astype(dict.fromkeys(counts, "Int64"))
 
 
-def _paper_notes(evaluated: Mapping[str, Evaluated]) -> list[str]:
+def _paper_notes(study: Study, evaluated: Mapping[str, Evaluated]) -> list[str]:
+    rule = rule_of(evaluated)
     notes = [
-        "Episodes: completed/requested. Success counts every episode. ± is the sample standard deviation "
-        "over replicates.",
-        "Errors are means over the final 1 s of an episode; mean and P95 are over the episodes that did not "
-        "end in a fall, an illegal contact or NaN (`Errors over` of them). The paper's columns are read so: "
-        "a P95 of 5.38 cm at 88 % success leaves no room for falls. "
+        "Episodes: completed/requested. Success counts every episode: both errors inside "
+        f"{tolerance_text(rule)} at every step of the {window_text(rule)} of {rule.horizon:g} s. ± is the "
+        "sample standard deviation over replicates.",
+        f"Errors are means over the {window_text(rule)} of an episode; mean and P95 are over the episodes "
+        "that did not end in a fall, an illegal contact or NaN (`Errors over` of them). "
         "The table over all episodes stands beside this one.",
-        f"Paper: {paper_values()['source']}, {paper_values()['ablation']['source']}. Its ± is over three "
-        "training seeds; its simulator and robot model are not ours.",
     ]
+    if study.paper:
+        paper = study.paper
+        notes.append(" ".join([f"Paper: {paper.source}, {paper.place}.", *paper.notes]))
     untrained = [spec for spec, method in evaluated.items() if not method.trained]
     if untrained:
         names = ", ".join(f"`{spec}`" for spec in untrained)
         notes.insert(
             1,
-            f"Not trained: {names}. Their replicates are disjoint sets of episodes met by one and the same "
-            "controller, not training seeds; their ± says how far those sets differ.",
+            f"No checkpoint is recorded for {names}. Replicates are disjoint sets of episodes: their ± says "
+            "how far those sets differ, not how far training seeds do.",
         )
     return notes

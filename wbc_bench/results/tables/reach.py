@@ -9,15 +9,14 @@ from wbc_bench.files import folder_name
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import (
     END_ZONE,
-    REACH_TOLERANCE,
     Evaluated,
     HeightRange,
     by_height,
     median,
     oscillation,
-    paper_values,
     reach_range,
     reached,
+    rule_of,
     stood,
     strata_of,
     subset,
@@ -28,7 +27,10 @@ from wbc_bench.results.formatting import (
     CM,
     NONE,
     number_text,
+    tolerance_text,
+    window_text,
 )
+from wbc_bench.results.study import Study
 from wbc_bench.results.table import Table
 
 
@@ -36,16 +38,18 @@ def _range(span: HeightRange) -> str:
     return "none" if np.isnan(span.low) else f"{span.low * CM:.0f}–{span.high * CM:.0f}"
 
 
-def reach_table(protocol: str, evaluated: Mapping[str, Evaluated]) -> Table:
+def reach_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
     """Lowest and highest height of each controller and variant, and how much it sways near them."""
     rows, data = [], []
-    block = paper_values()["reach"]
-    for name, (low, high) in ((k, v) for k, v in block.items() if k != "source"):
-        rows.append((f"{name}, paper ({block['source']})", *[NONE] * 3, f"{low}–{high}", *[NONE] * 4))
+    rule = rule_of(evaluated)
+    paper = study.paper
+    for name, (low, high) in (paper.ranges_cm if paper else {}).items():
+        place = paper.place if paper else ""
+        rows.append((f"{name}, paper ({place})", *[NONE] * 3, f"{low:g}–{high:g}", *[NONE] * 4))
         data.append({"controller": name, "source": "paper", "low_cm": low, "high_cm": high})
     for spec, method in evaluated.items():
         for k, (condition, orientation, episodes) in enumerate(variants(method.episodes)):
-            span, strict = reach_range(episodes), reach_range(episodes, strict=True)
+            span, strict = reach_range(episodes, rule), reach_range(episodes, rule, strict=True)
             speed = oscillation(episodes, span, "ee_speed_rms")
             sparc = oscillation(episodes, span, "ee_sparc")
             total = f"{len(episodes)}" if k else f"{len(episodes)} (run: {method.counts})"
@@ -73,21 +77,21 @@ def reach_table(protocol: str, evaluated: Mapping[str, Evaluated]) -> Table:
         *("Succeeded (cm)", "EE speed RMS (cm/s) low / mid / high", "SPARC low / mid / high"),
     )
     notes = (
-        "Reached: the longest run of neighbouring heights at which the median position error over the final "
-        f"1 s is below {REACH_TOLERANCE * CM:.0f} cm, a terminated episode counting as infinitely far. "
-        "Succeeded: the same with more than half of the episodes inside 5 cm and 7 deg at every step "
-        "of that second.",
-        "Oscillation in the final 1 s, median over episodes that did not terminate: within "
+        "Reached: the longest run of neighbouring heights at which the median position error over the "
+        f"{window_text(rule)} is below {rule.position * CM:g} cm, a terminated episode counting as "
+        "infinitely far. Succeeded: the same with more than half of the episodes inside "
+        f"{tolerance_text(rule)} at every step of that window.",
+        f"Oscillation in the {window_text(rule)}, median over episodes that did not terminate: within "
         f"{END_ZONE * CM:.0f} cm of the low end of the range reached, between, within as much of the high "
         "end. SPARC is the spectral arc length of the end-effector's speed (0 is smoothest).",
-        "The paper's ranges are of a real robot; it states no rule for what counts as reached.",
+        *(paper.notes if paper else ()),
     )
     frame = pd.DataFrame(data)
     frame["episodes"] = frame["episodes"].astype("Int64") if "episodes" in frame else pd.NA
-    return Table(f"{protocol}", f"{protocol}: heights reached", header, tuple(rows), notes, frame)
+    return Table(study.name, f"{study.name}: heights reached", header, tuple(rows), notes, frame)
 
 
-def height_table(protocol: str, method: Evaluated) -> Table:
+def height_table(study: Study, method: Evaluated) -> Table:
     """Success with its interval and median error at every height, a pair of columns a variant."""
     parts = [(c, o, dict(by_height(episodes))) for c, o, episodes in variants(method.episodes)]
     heights = sorted({height for _, _, groups in parts for height in groups})
@@ -121,7 +125,7 @@ def height_table(protocol: str, method: Evaluated) -> Table:
                         "low": rate.low,
                         "high": rate.high,
                     },
-                    "reached": reached(episodes),
+                    "reached": reached(episodes, method.rule),
                     "median_position_error_cm": error * CM,
                     "median_ee_speed_rms_cm_s": median(series(kept, "ee_speed_rms")) * CM,
                     "median_ee_sparc": median(series(kept, "ee_sparc")),
@@ -132,8 +136,8 @@ def height_table(protocol: str, method: Evaluated) -> Table:
     sizes = sorted({len(episodes) for _, _, groups in parts for episodes in groups.values()})
     notes = (
         f"{' or '.join(map(str, sizes))} episodes a height and variant. Success with its Wilson interval; "
-        "median position error over the final 1 s of episodes that did not terminate (in brackets: how many "
-        "did).",
+        f"median position error over the {window_text(method.rule)} of episodes that did not terminate "
+        "(in brackets: how many did).",
     )
-    name, title = f"{protocol}_heights_{folder_name(method.spec)}", f"{protocol}: {method.spec} by height"
+    name, title = f"{study.name}_heights_{folder_name(method.spec)}", f"{study.name}: {method.spec} by height"
     return Table(name, title, ("Height (cm)", *labels), tuple(rows), notes, pd.DataFrame(data))

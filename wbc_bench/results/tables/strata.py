@@ -54,8 +54,8 @@ def outcome_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
         "infeasible`: stood, off target, its solver without a solution at the end; "
         "`invalid`: NaN or diverged.",
     )
-    title = f"{study.protocol}: success and outcomes by stratum"
-    return Table(f"{study.protocol}_outcomes", title, header, tuple(rows), notes, pd.DataFrame(data))
+    title = f"{study.name}: success and outcomes by stratum"
+    return Table(f"{study.name}_outcomes", title, header, tuple(rows), notes, pd.DataFrame(data))
 
 
 def stratum_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
@@ -78,5 +78,5 @@ def stratum_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
         "Mean ± sample standard deviation over replicates. Success counts every episode of the stratum in "
         "both rows; the other columns are over the episodes named in the row.",
     )
-    title = f"{study.protocol}: the paper's columns by stratum"
-    return Table(f"{study.protocol}_strata", title, header, tuple(rows), notes, pd.DataFrame(data))
+    title = f"{study.name}: the paper's columns by stratum"
+    return Table(f"{study.name}_strata", title, header, tuple(rows), notes, pd.DataFrame(data))

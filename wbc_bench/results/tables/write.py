@@ -23,10 +23,10 @@ def write_study_tables(study: Study, evaluated: Mapping[str, Evaluated], out_dir
     return _write(tables, out_dir)
 
 
-def write_reach_tables(protocol: str, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
+def write_reach_tables(study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
     """The summary over controllers and one table of heights a controller."""
-    heights = (height_table(protocol, method) for method in evaluated.values())
-    return _write([reach_table(protocol, evaluated), *heights], out_dir)
+    heights = (height_table(study, method) for method in evaluated.values())
+    return _write([reach_table(study, evaluated), *heights], out_dir)
 
 
 def write_compare_table(
