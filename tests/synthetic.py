@@ -41,7 +41,14 @@ def record(controller: str, replicate: int, frame: pd.DataFrame, **changes) -> S
         **{"protocol": "ablation_v1", "protocol_digest": "d" * 64, "manifest_sha256": "a" * 64},
         **{"controller": controller, "controller_name": controller, "signals": ["proprioception", "ee_pose"]},
         **{"source": "test", "replicate": replicate, "requested": len(frame), "completed": len(frame)},
-        **{"checkpoint_sha256": None, "outcomes": outcome, "git_commit": "c" * 40, "git_dirty": False},
+        **{
+            "checkpoint_sha256": None,
+            "controller_sha256": None,
+            "resolved_controller": None,
+            "outcomes": outcome,
+            "git_commit": "c" * 40,
+            "git_dirty": False,
+        },
         **{
             "versions": {"mujoco": "4.0.1"},
             "machine": {"cpu": "<made up>"},

@@ -1,5 +1,6 @@
 """The Python interface: the rows of the command line, for a spec, an object and a class."""
 
+import shutil
 import subprocess
 import sys
 import threading
@@ -15,6 +16,8 @@ import wbc_bench
 from wbc_bench.controller import ControllerInfo, JointCommand
 from wbc_bench.errors import BenchError, ControllerError, StoreError, UnknownNameError
 from wbc_bench.evaluation.evaluate import EvaluationError
+from wbc_bench.results.analysis import collect
+from wbc_bench.results.store import ResultStore
 
 EPISODES = 60  # a whole shard and a short one
 
@@ -78,6 +81,12 @@ def test_an_object_that_cannot_be_copied_says_what_to_hand_over(tiny):
         wbc_bench.evaluate(one, tiny)
 
 
+def other_run(root: Path, replicate: int) -> Path:
+    """The folder of a replicate of the only controller below a store."""
+    (folder,) = (root / "runs" / "tiny").iterdir()
+    return folder / f"replicate_{replicate}"
+
+
 def test_swapped_weights_are_never_reused(tiny, tmp_path):
     """Neither those of a finished run, nor those of a replicate that another table row would pool."""
     spec = write_controller(
@@ -93,6 +102,11 @@ def test_swapped_weights_are_never_reused(tiny, tmp_path):
         wbc_bench.evaluate(spec, tiny, episodes=3, replicates=1, out=tmp_path / "out")
     with pytest.raises(StoreError, match="--overwrite"):
         wbc_bench.evaluate(spec, tiny, episodes=3, replicates=2, out=tmp_path / "out")
+    other = wbc_bench.evaluate(spec, tiny, episodes=3, replicates=2, out=tmp_path / "other")
+    shutil.copytree(other_run(tmp_path / "other", 1), other_run(tmp_path / "out", 1))
+    assert len(other.records) == 2
+    with pytest.raises(StoreError, match="replicates 0 and 1 of .* different code or files"):
+        collect(ResultStore(tmp_path / "out").runs("tiny"))
     again = wbc_bench.evaluate(spec, tiny, episodes=3, replicates=1, out=tmp_path / "out", overwrite=True)
     assert not again.episodes.equals(first.episodes)
 

@@ -93,6 +93,8 @@ def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
     grouped: dict[str, list[Any]] = {}
     for run in runs:
         grouped.setdefault(run.record.controller, []).append(run)
+    for group in grouped.values():
+        _refuse_two_versions([run.record for run in group])
     return {
         spec: Evaluated(
             spec,
@@ -101,6 +103,23 @@ def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
         )
         for spec, group in grouped.items()
     }
+
+
+def _refuse_two_versions(records: Sequence[Any]) -> None:
+    """Replicates that one and the same controller met must have met the same code and files of it.
+
+    Raises: StoreError, otherwise a row would pool, say, two checkpoints. Records before 0.1.0 do not tell.
+    """
+    first: dict[str, tuple[str, int]] = {}
+    for record in records:
+        if record.resolved_controller and record.controller_sha256:
+            seen = first.setdefault(record.resolved_controller, (record.controller_sha256, record.replicate))
+            if seen[0] != record.controller_sha256:
+                raise StoreError(
+                    f"replicates {seen[1]} and {record.replicate} of '{record.controller}' under "
+                    f"{record.protocol} were evaluated with different code or files of the controller; "
+                    "evaluate one of them again with --overwrite"
+                )
 
 
 def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
