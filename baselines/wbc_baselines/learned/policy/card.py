@@ -52,13 +52,13 @@ class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     observation: int
     command: int
     history: int  # control steps
-    history_term: int
+    history_frame: int = msgspec.field(name="history_term")
     context: int
     state: int
     actions: int
 
 
-class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class PolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a checkpoint is and where it comes from."""
 
     format: int
@@ -75,8 +75,9 @@ class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     git_commit: str | None
     git_dirty: bool
     dimensions: Dimensions
-    start: str = ""  # name and SHA-256 of the checkpoint that it began with
-    teacher: str = ""  # and of the one that it imitated at first
+    # name and SHA-256 of the checkpoint that initialized it, and of the one it was distilled from
+    init_checkpoint: str = msgspec.field(default="", name="start")
+    teacher: str = ""
     sha256: str = ""  # of the safetensors file
 
 
@@ -120,7 +121,7 @@ def conditions(protocol: EvalProtocol) -> dict[str, Any]:
     return msgspec.json.decode(msgspec.json.encode(found))
 
 
-def other_conditions(card: Card, protocol: EvalProtocol) -> str:
+def other_conditions(card: PolicyCard, protocol: EvalProtocol) -> str:
     """`field: trained X, here Y` of every condition of a protocol that differs from the training's."""
     trained, here, lines = card.conditions, conditions(protocol), []
     names, kind = trained.keys() | here.keys(), "targets.type"
@@ -133,11 +134,11 @@ def other_conditions(card: Card, protocol: EvalProtocol) -> str:
     return "; ".join(lines)
 
 
-def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> Card:
+def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> PolicyCard:
     """The card of a policy trained here, by this code: control steps and wall time [s] it took."""
     facts = robot_facts(load_robot(protocol.robot), protocol.control_period)
     commit, dirty = provenance.commit()
-    return Card(
+    return PolicyCard(
         format=FORMAT,
         method=method,
         seed=seed,
@@ -155,7 +156,7 @@ def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: E
     )
 
 
-def read_card(path: Path) -> Card:
+def read_card(path: Path) -> PolicyCard:
     """The card beside a safetensors file, itself whole and of a method and dimensions that exist here.
 
     Raises: CheckpointError, UnknownNameError.
@@ -167,13 +168,13 @@ def read_card(path: Path) -> Card:
     return decode_card(beside.read_bytes(), str(beside))
 
 
-def decode_card(text: bytes, where: str) -> Card:
+def decode_card(text: bytes, where: str) -> PolicyCard:
     """The card of a JSON text. Raises: CheckpointError, UnknownNameError."""
     try:
         version = msgspec.json.decode(text, type=_Version).format
         if version != FORMAT:
             raise CheckpointError(f"checkpoint card '{where}' has format {version}, valid: {FORMAT}")
-        card = msgspec.json.decode(text, type=Card)
+        card = msgspec.json.decode(text, type=PolicyCard)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise CheckpointError(f"checkpoint card '{where}' cannot be read: {error}") from error
     if card.method not in METHODS:
@@ -186,7 +187,7 @@ def decode_card(text: bytes, where: str) -> Card:
     return card
 
 
-def check_fit(card: Card, robot: Robot | None, control_period: float | None, where: str) -> None:
+def check_fit(card: PolicyCard, robot: Robot | None, control_period: float | None, where: str) -> None:
     """Raises: CheckpointError with every field in which robot or control period [s] differ from training."""
     period = card.robot.control_period if control_period is None else control_period
     here = robot_facts(robot, period) if robot else msgspec.structs.replace(card.robot, control_period=period)
@@ -208,7 +209,7 @@ def _dimensions(estimator: Estimator) -> Dimensions:
         observation=inputs.OBSERVATION,
         command=inputs.COMMAND,
         history=inputs.HISTORY,
-        history_term=inputs.HISTORY_TERM,
+        history_frame=inputs.HISTORY_FRAME,
         context=estimator.context_dim,
         state=estimator.state_dim,
         actions=inputs.ACTIONS,

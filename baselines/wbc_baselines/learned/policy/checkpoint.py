@@ -12,7 +12,7 @@ from safetensors.torch import load as tensors_of
 from safetensors.torch import save as bytes_of
 
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.card import Card, CheckpointError, card_path, check_fit, read_card
+from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, card_path, check_fit, read_card
 from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.networks import Actor
@@ -27,12 +27,12 @@ CHECKPOINTS = Path(__file__).parents[1] / "checkpoints"  # METHOD@SEED.safetenso
 class Checkpoint(NamedTuple):
     """A loaded checkpoint."""
 
-    card: Card
+    card: PolicyCard
     actor: Actor
     estimator: Estimator
 
 
-def save(path: Path, actor: Actor, estimator: Estimator, card: Card) -> None:
+def save(path: Path, actor: Actor, estimator: Estimator, card: PolicyCard) -> None:
     """Write PATH.safetensors and its card; a card never stands beside weights that are not its own."""
     tensors = {f"actor.{name}": value for name, value in actor.state_dict().items()}
     tensors |= {f"estimator.{name}": value for name, value in estimator.state_dict().items()}
@@ -80,7 +80,7 @@ def identity(name: str) -> str:
     return f"{find(name).stem} {read_card(find(name)).sha256}" if name else ""
 
 
-def load_start(name: str, estimator: str) -> Checkpoint:
+def load_init_checkpoint(name: str, estimator: str) -> Checkpoint:
     """A checkpoint that a method with this estimator can begin with; see `shared_context`.
 
     Raises: CheckpointError, its estimator is a third one; and see `load`.
@@ -89,8 +89,8 @@ def load_start(name: str, estimator: str) -> Checkpoint:
     theirs = METHODS[found.card.method]
     if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(
-            f"--start '{name}' is of {found.card.method}, valid: a method without a context, the oracle, "
-            f"or a method with the estimator '{estimator}'"
+            f"--init-checkpoint '{name}' is of {found.card.method}, valid: a method without a context, "
+            f"the oracle, or a method with the estimator '{estimator}'"
         )
     return found
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wbc_baselines.learned.policy import checkpoint, inputs
-from wbc_baselines.learned.policy.card import Card, CheckpointError, check_fit, other_conditions
+from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, check_fit, other_conditions
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.onnx_engine import OnnxEngine
 from wbc_baselines.learned.policy.policy import Flow, Policy
@@ -44,7 +44,7 @@ class LearnedController:
 
     formats = ("onnx",)
 
-    def __init__(self, robot: Robot, card: Card, engine: Engine, name: str, sha256: str) -> None:
+    def __init__(self, robot: Robot, card: PolicyCard, engine: Engine, name: str, sha256: str) -> None:
         torch.set_num_threads(1)
         period = card.robot.control_period
         trained = f"{card.samples:.3g} control steps of {card.protocol}"
@@ -79,7 +79,7 @@ class LearnedController:
         self._action = torch.zeros(count, inputs.ACTIONS)
         self._carried: dict[str, Tensor] = {}
         if "window" in flow:
-            self._carried["window"] = inputs.history_term(*self._measured(obs))[:, None].repeat(
+            self._carried["window"] = inputs.history_frame(*self._measured(obs))[:, None].repeat(
                 1, inputs.HISTORY, 1
             )
         if "state" in flow:
@@ -101,7 +101,7 @@ class LearnedController:
             **self._carried,
         }
         if "term" in self._engine.flow.inputs:
-            values["term"] = inputs.history_term(*measured)
+            values["term"] = inputs.history_frame(*measured)
         if "privileged" in self._engine.flow.inputs:
             values["privileged"] = _privileged(obs)
         found = self._engine(values)

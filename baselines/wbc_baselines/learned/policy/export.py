@@ -12,7 +12,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from wbc_baselines.learned.policy.card import Card
+from wbc_baselines.learned.policy.card import PolicyCard
 from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, _output
 from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.files import write_atomic
@@ -31,7 +31,7 @@ class _Positional(nn.Module):
         return tuple(found[name] for name in flow.outputs)
 
 
-def write_onnx(path: Path, policy: Policy, card: Card) -> None:
+def write_onnx(path: Path, policy: Policy, card: PolicyCard) -> None:
     """Write a policy and its card; the batch is free."""
     flow = policy.flow
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():

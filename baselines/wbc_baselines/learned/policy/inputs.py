@@ -78,7 +78,7 @@ def columns(layout: Layout, term: str) -> slice:
 
 OBSERVATION = width(OBSERVATION_LAYOUT)
 COMMAND = width(COMMAND_LAYOUT)
-HISTORY_TERM = width(HISTORY_LAYOUT)
+HISTORY_FRAME = width(HISTORY_LAYOUT)
 NEXT_OBSERVATION = width(NEXT_OBSERVATION_LAYOUT)
 PRIVILEGED = width(PRIVILEGED_LAYOUT)
 VELOCITY, LATENT = 3, 64  # of the context z = (v, xi). Source: paper, Table I
@@ -90,14 +90,14 @@ CONTEXT_LAYOUT: Layout = (
     ),
 )
 # Source: paper, Table I and section III
-assert (OBSERVATION, COMMAND, HISTORY_TERM, NEXT_OBSERVATION, CONTEXT_MAX) == (58, 9, 57, 49, 67)
+assert (OBSERVATION, COMMAND, HISTORY_FRAME, NEXT_OBSERVATION, CONTEXT_MAX) == (58, 9, 57, 49, 67)
 assert PRIVILEGED == 80
 
 LAYOUTS: dict[str, Layout] = {
     "observation": OBSERVATION_LAYOUT,
     "command": COMMAND_LAYOUT,
     "context": CONTEXT_LAYOUT,
-    f"history term (window of {HISTORY})": HISTORY_LAYOUT,
+    f"history frame (window of {HISTORY})": HISTORY_LAYOUT,
     "next observation (decoder's target, without noise)": NEXT_OBSERVATION_LAYOUT,
     "privileged (critic and oracle, without noise)": PRIVILEGED_LAYOUT,
 }
@@ -133,7 +133,7 @@ def command(target_pos_b: "Tensor", target_rot_b: "Tensor") -> "Tensor":
     return _join(COMMAND_LAYOUT, target_pos_b, target_rot_b[..., :, 0], target_rot_b[..., :, 1])
 
 
-def history_term(
+def history_frame(
     ang_vel_b: "Tensor",
     gravity_b: "Tensor",
     joint_pos_rel: "Tensor",

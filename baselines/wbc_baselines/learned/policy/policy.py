@@ -9,7 +9,7 @@ from wbc_baselines.learned.policy.estimators import Estimator
 from wbc_baselines.learned.policy.inputs import (
     COMMAND,
     HISTORY,
-    HISTORY_TERM,
+    HISTORY_FRAME,
     OBSERVATION,
     PRIVILEGED,
     VELOCITY,
@@ -53,7 +53,7 @@ def flow_of(estimator: Estimator) -> Flow:
     inputs: dict[str, tuple[int, ...]] = {"observation": (OBSERVATION,), "command": (COMMAND,)}
     outputs = ["action"]
     if estimator.trainable:
-        inputs |= {"term": (HISTORY_TERM,), "window": (HISTORY, HISTORY_TERM)}
+        inputs |= {"term": (HISTORY_FRAME,), "window": (HISTORY, HISTORY_FRAME)}
         outputs.append("window")
         if estimator.state_dim:
             inputs["state"] = (estimator.state_dim,)

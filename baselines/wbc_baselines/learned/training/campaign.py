@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.training.config import Settings
+from wbc_baselines.learned.training.config import TrainConfig
 from wbc_baselines.learned.training.run_folder import RunFolder, run
 
 Progress = Callable[[int, int, str], None]
@@ -23,16 +23,16 @@ class Standing(NamedTuple):
     falls: float | None
 
 
-def runs_of(base: Settings, methods: Sequence[str], seeds: int) -> list[Settings]:
+def runs_of(base: TrainConfig, methods: Sequence[str], seeds: int) -> list[TrainConfig]:
     """Every method with every seed; seeds outermost, so that a campaign cut short compares all methods."""
     for method in methods:
         replace(base, method=method).check()
     return [replace(base, method=method, seed=seed) for seed in range(seeds) for method in methods]
 
 
-def campaign(settings: Sequence[Settings], out: Path, progress: Progress) -> Iterator[Settings]:
-    """Train whatever of `settings` is not done and nobody else trains; yields each run finished here."""
-    for one in settings:
+def campaign(config: Sequence[TrainConfig], out: Path, progress: Progress) -> Iterator[TrainConfig]:
+    """Train whatever of `config` is not done and nobody else trains; yields each run finished here."""
+    for one in config:
         folder = RunFolder(out / one.name)
         if is_done(folder, one) or not folder.take():
             continue
@@ -41,17 +41,17 @@ def campaign(settings: Sequence[Settings], out: Path, progress: Progress) -> Ite
         yield one
 
 
-def is_done(folder: RunFolder, settings: Settings) -> bool:
+def is_done(folder: RunFolder, config: TrainConfig) -> bool:
     """Whether the run has been finished at this budget or more."""
     import json
 
-    return folder.finished.exists() and json.loads(folder.finished.read_text())["samples"] >= settings.budget
+    return folder.finished.exists() and json.loads(folder.finished.read_text())["samples"] >= config.budget
 
 
 def standing(out: Path) -> list[Standing]:
     """Where every run below a folder stands."""
     found = []
-    for path in sorted(out.glob("*@*/settings.json")):
+    for path in sorted(out.glob("*@*/config.json")):
         folder = RunFolder(path.parent)
         rows = folder.read_metrics()
         last = rows[-1] if rows else {}

@@ -1,4 +1,4 @@
-"""The folder of a run: settings, metrics, resume state, final checkpoint. Every write is whole or absent."""
+"""The folder of a run: config, metrics, resume state, final checkpoint. Every write is whole or absent."""
 
 import json
 import os
@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_bench.files import write_atomic
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ class RunFolder:
     path: Path
 
     @property
-    def settings(self) -> Path:
-        return self.path / "settings.json"
+    def config(self) -> Path:
+        return self.path / "config.json"
 
     @property
     def metrics(self) -> Path:
@@ -59,15 +59,15 @@ class RunFolder:
         """Written last, when budget and final checkpoint are there."""
         return self.path / "finished.json"
 
-    def open(self, settings: Settings, change: bool = False) -> None:
+    def open(self, config: TrainConfig, change: bool = False) -> None:
         """Make the folder, or check that it belongs to these settings; with `change`, note what is new.
 
         Raises:
             TrainingError: it holds a run with other settings; they are listed.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        if self.settings.exists():
-            changed = settings.changes(json.loads(self.settings.read_text()))
+        if self.config.exists():
+            changed = config.changes(json.loads(self.config.read_text()))
             fixed = ("method", "seed", "protocol")  # what the run is called and judged by
             wrong = {n: c for n, c in changed.items() if not change or n in fixed}
             if wrong:
@@ -81,7 +81,7 @@ class RunFolder:
                 rows = self.read_metrics()
                 row = {"samples": rows[-1]["samples"] if rows else 0, "changed": changed}
                 _append(self.changes, row)
-        write_atomic(self.settings, json.dumps(asdict(settings), indent=2).encode())
+        write_atomic(self.config, json.dumps(asdict(config), indent=2).encode())
 
     def read_metrics(self) -> list[dict]:
         """Metrics by iteration; a line that a kill has cut short is left out."""
@@ -174,13 +174,13 @@ def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
     except (KeyError, TypeError) as error:  # a field too few or too many
         raise TrainingError(
             f"resume file '{folder.resume}' is of another version of the code ({error}); valid: the version "
-            "that wrote it, or another --out with --start at the run's checkpoint"
+            "that wrote it, or another --out with --init-checkpoint at the run's checkpoint"
         ) from error
     return saved["seconds"]
 
 
 def run(
-    settings: Settings,
+    config: TrainConfig,
     folder: RunFolder,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     tensorboard: bool = True,
@@ -196,19 +196,19 @@ def run(
     from wbc_baselines.learned.training.make import make_environment
     from wbc_baselines.learned.training.trainer import Trainer, duration
 
-    settings.check()
+    config.check()
     if not folder.take():
         raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
     try:
-        folder.open(settings, change)
-        trainer = Trainer(settings, make_environment(settings))
+        folder.open(config, change)
+        trainer = Trainer(config, make_environment(config))
         before = load_resume(trainer, folder)
         if not trainer.done:
             folder.finished.unlink(missing_ok=True)  # at a smaller budget
         started, first = time.monotonic() - before, trainer.samples
         saved = time.monotonic()
         writer = _writer(folder, trainer.iteration) if tensorboard else None
-        per_iteration = settings.envs * settings.steps
+        per_iteration = config.num_envs * config.num_steps_per_env
         with _stop_requests() as stop:
             while not trainer.done:
                 metrics = trainer.iterate()
@@ -219,7 +219,7 @@ def run(
                 if writer:
                     for name, value in metrics.items():
                         writer.add_scalar(name, value, trainer.samples)
-                progress(trainer.samples - first, int(settings.budget) - first, line(trainer, metrics, rate))
+                progress(trainer.samples - first, int(config.budget) - first, line(trainer, metrics, rate))
                 if stop or trainer.done or time.monotonic() - saved > CHECKPOINT_PERIOD:
                     save_resume(trainer, folder, seconds)
                     saved = time.monotonic()
@@ -256,7 +256,7 @@ def line(trainer: "Trainer", metrics: dict[str, float], rate: float) -> str:
     """How training stands, for a progress line."""
     share = {name: metrics[f"episode/{name}"] for name in ("success", "falls")}
     return (
-        f"{trainer.settings.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
+        f"{trainer.config.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
         f"return {metrics['episode/return']:.1f}, success {share['success']:.1%}, falls {share['falls']:.1%}"
     )
 

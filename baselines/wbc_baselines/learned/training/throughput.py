@@ -10,7 +10,7 @@ from typing import NamedTuple
 import mujoco.batch
 
 from wbc_baselines.learned.policy import checkpoint
-from wbc_baselines.learned.training.config import Settings
+from wbc_baselines.learned.training.config import TrainConfig
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.evaluation import simulation
@@ -43,7 +43,7 @@ class EngineClock(mujoco.batch.Batch):
 
 
 def measure(
-    settings: Settings, methods: Sequence[str], rounds: int = ROUNDS, episodes: int = EPISODES
+    config: TrainConfig, methods: Sequence[str], rounds: int = ROUNDS, episodes: int = EPISODES
 ) -> list[Speed]:
     """Train and evaluate the methods in turns, each from its policy that ships, or else from the oracle's.
 
@@ -55,27 +55,27 @@ def measure(
     from wbc_baselines.learned.training.trainer import Trainer, duration
 
     available = checkpoint.available()
-    ours = {m: name for m in methods if (name := f"{m}@{settings.seed}") in available}
-    protocol, path = find_protocol(settings.protocol)
+    ours = {m: name for m in methods if (name := f"{m}@{config.seed}") in available}
+    protocol, path = find_protocol(config.protocol)
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, episodes)
-    control_steps = settings.envs * settings.steps
+    control_steps = config.num_envs * config.num_steps_per_env
     training: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
     evaluation: dict[str, list[float]] = {method: [] for method in methods}
     with _engine_clocks():
         trainers = []
         for method in methods:
-            chosen = replace(settings, method=method, start=ours.get(method, "oracle@0"), teacher="")
+            chosen = replace(config, method=method, init_checkpoint=ours.get(method, "oracle@0"), teacher="")
             trainers.append(Trainer(chosen, make_environment(chosen)))
         for _ in range(rounds):
             for trainer in trainers:
                 before = EngineClock.seconds
                 whole = duration(trainer.iterate())
-                training[trainer.settings.method].append((whole, EngineClock.seconds - before))
+                training[trainer.config.method].append((whole, EngineClock.seconds - before))
         torch.set_num_threads(1)
         for _ in range(rounds):
             for method, name in ours.items():
                 evaluation[method].append(_evaluation(f"learned:{name}", protocol, rows))
-        torch.set_num_threads(settings.threads)
+        torch.set_num_threads(config.threads)
     return [
         Speed(
             method,

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from wbc_baselines.learned.policy.estimators.base import Batch, Estimator
 from wbc_baselines.learned.policy.estimators.memory import Memory
-from wbc_baselines.learned.policy.inputs import HISTORY_TERM, VELOCITY
+from wbc_baselines.learned.policy.inputs import HISTORY_FRAME, VELOCITY
 from wbc_baselines.learned.policy.normalizer import Normalizer
 
 VARIANCE_FLOOR = 1e-4  # Source: paper, eq. estimated_context
@@ -59,7 +59,7 @@ class LatentEstimator(Estimator):
 
     def __init__(self, encoder: nn.Module, memory: Memory | None, decoder: nn.Module) -> None:
         super().__init__()
-        self.normalizer = Normalizer(HISTORY_TERM)
+        self.normalizer = Normalizer(HISTORY_FRAME)
         self.encoder, self.memory, self.decoder = encoder, memory, decoder
 
     def step(self, history: Tensor, state: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from wbc_baselines.learned.policy.inputs import HISTORY, HISTORY_TERM
+from wbc_baselines.learned.policy.inputs import HISTORY, HISTORY_FRAME
 
 # Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e; no dropout
 MODEL, LAYERS, HEADS, FEED_FORWARD = 128, 2, 8, 512
@@ -72,7 +72,7 @@ class WindowEncoder(nn.Module):
 
     def __init__(self, size: int) -> None:
         super().__init__()
-        self.embed = nn.Linear(HISTORY_TERM, MODEL)
+        self.embed = nn.Linear(HISTORY_FRAME, MODEL)
         self.register_buffer("positions", sinusoids(HISTORY, MODEL), persistent=False)
         self.layers = nn.ModuleList(Layer() for _ in range(LAYERS))
         self.read_out = nn.Linear(MODEL, size)

@@ -11,7 +11,7 @@ from wbc_bench.evaluation.simulation import Places
 MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10 ms steps counts as diverged
 
 
-class Start(NamedTuple):
+class ResetState(NamedTuple):
     """How K episodes start: columns as those of an evaluation's manifest, float64."""
 
     base_height: Tensor  # (K,) [m]
@@ -92,7 +92,7 @@ class Backend(Protocol):
     num_envs: int
     device: torch.device
 
-    def reset(self, ids: Tensor, start: Start) -> State:
+    def reset(self, ids: Tensor, reset: ResetState) -> State:
         """Start the simulations `ids` (K,) anew; their state, K rows."""
         ...
 
