@@ -79,8 +79,8 @@ class TrainConfig:
     """Interval [control steps] during which an imitation loss toward the arm's inverse kinematics is added to
     PPO; 0 0 for never."""
     posture_loss: tuple[float, float] = (8e6, 57e6)
-    """Interval [control steps] during which robots that stand still while the target is out of the arm's
-    reach imitate a leg posture that reaches it, in addition to PPO; 0 0 for never."""
+    """Interval [control steps] during which robots that stand still with the hand short of a target, although
+    it needs no step, imitate a leg posture that reaches it, in addition to PPO; 0 0 for never."""
     symmetry_augmentation: bool = False
     """Whether PPO also learns from the mirror image of every sample; only for methods without an estimator,
     because the inputs of an estimator are not mirrored."""
