@@ -22,7 +22,7 @@ def option_types(command: type) -> dict[type, None]:
     """The dataclasses whose fields are options of a command: itself, and those of nested fields."""
     found = {command: None}
     for hint in typing.get_type_hints(command).values():
-        if is_dataclass(hint):
+        if isinstance(hint, type) and is_dataclass(hint):
             found |= option_types(hint)
     return found
 

@@ -1,7 +1,7 @@
-"""The card of a checkpoint: what a policy is, where it comes from, and the robot that it was trained for.
+"""The card of a checkpoint: the policy's method, its training, and the robot that it was trained for.
 
-Everything on the card is checked when a checkpoint is loaded: transfers fail in silence where joint order,
-gains, limits, default posture or end-effector frame of the robot are not those of the training.
+The card is checked whenever a checkpoint is loaded, because a policy fails silently if joint order, gains,
+limits, default posture or end-effector frame of the robot differ from those of the training.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ class CheckpointError(BenchError):
 
 
 class RobotFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What of robot and protocol a policy depends on; per joint in `joints` order."""
+    """The properties of robot and protocol that a policy depends on; joint values in `joints` order."""
 
     joints: tuple[str, ...]
     default_q: Numbers  # [rad]
@@ -47,7 +47,7 @@ class RobotFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Columns of inputs and outputs."""
+    """Numbers of columns of the inputs and outputs."""
 
     observation: int
     command: int
@@ -59,7 +59,7 @@ class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a checkpoint is and where it comes from."""
+    """The identity and origin of a checkpoint. The JSON file keeps the first names of renamed fields."""
 
     format: int
     method: str
@@ -82,7 +82,7 @@ class PolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
-    """The facts of a robot that is commanded every `control_period` [s]."""
+    """Collect the facts of a robot that is commanded every `control_period` [s]."""
     facts, tcp = robot.facts, tcp_of(robot.facts, robot.config)
     mount = mount_of(facts, robot.config)
     bodies = [facts.base, facts.fixed, facts.foot, facts.links, facts.joints, mount.lumps]
@@ -103,10 +103,10 @@ def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
 
 
 def conditions(protocol: EvalProtocol) -> dict[str, Any]:
-    """What episodes of a protocol are like: `section.field` by value, as JSON holds it.
+    """Collect the conditions of a protocol's episodes, `section.field` by value, in the types of JSON.
 
-    Left out is what no policy meets (names, counts, seed, the rule of success), what `RobotFacts` holds, and
-    the physics step, which is longer in training than in any evaluation.
+    Properties that no policy can notice are left out (names, counts, seed, the rule of success), as are those
+    in `RobotFacts`, and the physics step, which is longer in training than in any evaluation.
     """
     sections = msgspec.to_builtins(protocol)
     for name in ("name", "description", "success", "robot", "physics"):
@@ -122,7 +122,7 @@ def conditions(protocol: EvalProtocol) -> dict[str, Any]:
 
 
 def other_conditions(card: PolicyCard, protocol: EvalProtocol) -> str:
-    """`field: trained X, here Y` of every condition of a protocol that differs from the training's."""
+    """Describe all conditions of a protocol that differ from the training, `field: trained X, here Y`."""
     trained, here, lines = card.conditions, conditions(protocol), []
     names, kind = trained.keys() | here.keys(), "targets.type"
     if trained.get(kind) != here[kind]:  # then the other fields of targets have nothing in common
@@ -135,7 +135,18 @@ def other_conditions(card: PolicyCard, protocol: EvalProtocol) -> str:
 
 
 def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> PolicyCard:
-    """The card of a policy trained here, by this code: control steps and wall time [s] it took."""
+    """Create the card of a policy that this code has trained.
+
+    Args:
+        method: Method of the study.
+        seed: Seed of the training.
+        samples: Control steps of the training.
+        wall_time: Duration of the training [s].
+        protocol: Protocol of the training.
+
+    Returns:
+        The card, without the digest of the weights.
+    """
     facts = robot_facts(load_robot(protocol.robot), protocol.control_period)
     commit, dirty = provenance.commit()
     return PolicyCard(
@@ -157,9 +168,17 @@ def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: E
 
 
 def read_card(path: Path) -> PolicyCard:
-    """The card beside a safetensors file, itself whole and of a method and dimensions that exist here.
+    """Read and check the card beside a safetensors file.
 
-    Raises: CheckpointError, UnknownNameError.
+    Args:
+        path: The safetensors file.
+
+    Returns:
+        The card, of a method and dimensions that exist here.
+
+    Raises:
+        CheckpointError: A file is missing, or the card is damaged or of other dimensions.
+        UnknownNameError: There is no such method.
     """
     beside = card_path(path)
     for file in (path, beside):
@@ -169,7 +188,19 @@ def read_card(path: Path) -> PolicyCard:
 
 
 def decode_card(text: bytes, where: str) -> PolicyCard:
-    """The card of a JSON text. Raises: CheckpointError, UnknownNameError."""
+    """Decode and check a card.
+
+    Args:
+        text: JSON text.
+        where: Name of its file, for error messages.
+
+    Returns:
+        The card, of a method and dimensions that exist here.
+
+    Raises:
+        CheckpointError: The card is damaged, altered, or of another format or other dimensions.
+        UnknownNameError: There is no such method.
+    """
     try:
         version = msgspec.json.decode(text, type=_Version).format
         if version != FORMAT:
@@ -188,7 +219,17 @@ def decode_card(text: bytes, where: str) -> PolicyCard:
 
 
 def check_fit(card: PolicyCard, robot: Robot | None, control_period: float | None, where: str) -> None:
-    """Raises: CheckpointError with every field in which robot or control period [s] differ from training."""
+    """Check that a policy fits a robot and a control period.
+
+    Args:
+        card: Card of the policy.
+        robot: Robot to control; None to leave it unchecked.
+        control_period: Control period [s]; None to leave it unchecked.
+        where: Name of the checkpoint, for error messages.
+
+    Raises:
+        CheckpointError: Robot or control period differ from the training; all differing fields are listed.
+    """
     period = card.robot.control_period if control_period is None else control_period
     here = robot_facts(robot, period) if robot else msgspec.structs.replace(card.robot, control_period=period)
     if differences := _differences(card.robot, here):
@@ -196,7 +237,7 @@ def check_fit(card: PolicyCard, robot: Robot | None, control_period: float | Non
 
 
 def card_path(path: Path) -> Path:
-    """Where the card of a safetensors file stands: beside it."""
+    """Return the path of the card of a safetensors file, which is stored beside it."""
     return path.with_suffix(".json")
 
 

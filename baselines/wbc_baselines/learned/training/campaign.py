@@ -1,4 +1,4 @@
-"""All methods and seeds at one equal budget, in any order, on any number of machines that share a folder."""
+"""Training of several methods and seeds at an equal budget, on any number of machines that share a folder."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -13,26 +13,50 @@ Progress = Callable[[int, int, str], None]
 
 
 class Standing(NamedTuple):
-    """Where one run stands."""
+    """The progress of one run."""
 
     name: str
     state: str  # done, running, interrupted, not started
-    samples: int
-    seconds: float
+    samples: int  # control steps
+    seconds: float  # of training
     success: float | None  # of the episodes that ended in the last iteration
     falls: float | None
 
 
 def runs_of(base: TrainConfig, methods: Sequence[str], seeds: int) -> list[TrainConfig]:
-    """Every method with every seed; seeds outermost, so that a campaign cut short compares all methods."""
+    """List the configurations of all methods and seeds, ordered by seed.
+
+    A campaign that is cut short has then trained all methods with the same seeds.
+
+    Args:
+        base: Settings that all runs share.
+        methods: Methods to train.
+        seeds: Number of seeds per method.
+
+    Returns:
+        One configuration per run.
+
+    Raises:
+        UnknownNameError: There is no such method.
+        TrainingError: A setting is out of its range.
+    """
     for method in methods:
         replace(base, method=method).check()
     return [replace(base, method=method, seed=seed) for seed in range(seeds) for method in methods]
 
 
-def campaign(config: Sequence[TrainConfig], out: Path, progress: Progress) -> Iterator[TrainConfig]:
-    """Train whatever of `config` is not done and nobody else trains; yields each run finished here."""
-    for one in config:
+def campaign(configs: Sequence[TrainConfig], out: Path, progress: Progress) -> Iterator[TrainConfig]:
+    """Train all runs that are neither finished nor claimed by another process.
+
+    Args:
+        configs: Configurations of the runs.
+        out: Folder of all runs.
+        progress: Is called with completed and total control steps and a line of text.
+
+    Yields:
+        The configuration of each run that was finished here.
+    """
+    for one in configs:
         folder = RunFolder(out / one.name)
         if is_done(folder, one) or not folder.take():
             continue
@@ -42,14 +66,14 @@ def campaign(config: Sequence[TrainConfig], out: Path, progress: Progress) -> It
 
 
 def is_done(folder: RunFolder, config: TrainConfig) -> bool:
-    """Whether the run has been finished at this budget or more."""
+    """Return whether the run has been finished with this budget or a larger one."""
     import json
 
     return folder.finished.exists() and json.loads(folder.finished.read_text())["samples"] >= config.budget
 
 
 def standing(out: Path) -> list[Standing]:
-    """Where every run below a folder stands."""
+    """List the progress of all runs below a folder, ordered by method."""
     found = []
     for path in sorted(out.glob("*@*/config.json")):
         folder = RunFolder(path.parent)

@@ -1,4 +1,4 @@
-"""The training environment of a configuration."""
+"""Construction of the training environment from a configuration."""
 
 import msgspec
 
@@ -10,10 +10,16 @@ from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 
 
 def training_protocol(config: TrainConfig) -> EvalProtocol:
-    """The protocol with the physics step and the pushes of training.
+    """Return the protocol of a configuration with the physics step and the pushes of training.
+
+    Args:
+        config: Configuration of the run.
+
+    Returns:
+        The changed protocol.
 
     Raises:
-        TrainingError: the control period would not be the protocol's.
+        TrainingError: The control period would differ from the protocol's.
     """
     protocol, _ = find_protocol(config.protocol)
     physics = msgspec.structs.replace(
@@ -32,7 +38,19 @@ def training_protocol(config: TrainConfig) -> EvalProtocol:
 
 
 def make_environment(config: TrainConfig, target_set: TargetSet | None = None) -> Environment:
-    """The environment of a run; the target_set that ships, if none is given."""
+    """Build the environment of a run.
+
+    Args:
+        config: Configuration of the run.
+        target_set: Targets that episodes pick from; None for the set that ships with the package.
+
+    Returns:
+        The environment, with its first episodes begun.
+
+    Raises:
+        TrainingError: The physics step does not fit the protocol, or the backend is not available.
+        ManifestError: The target set is missing or was generated for another protocol.
+    """
     protocol = training_protocol(config)
     if config.backend == "warp":
         from wbc_baselines.learned.training.backends.warp import WarpBackend

@@ -9,7 +9,7 @@ WINDOW, LATENT = 5, 16  # Source: Nahrendra et al. 2023 (DreamWaQ), section III-
 
 
 class NewestFrames(nn.Sequential):
-    """Windows (N, HISTORY, 57) -> e (N, 3 + 2 LATENT) of their last WINDOW terms."""
+    """Windows (N, HISTORY, 57) -> e (N, 3 + 2 LATENT) of their last WINDOW frames."""
 
     def __init__(self) -> None:
         super().__init__(*mlp(WINDOW * HISTORY_FRAME, 128, 64, VELOCITY + 2 * LATENT))

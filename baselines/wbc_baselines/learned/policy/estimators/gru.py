@@ -1,4 +1,4 @@
-"""GRU only: a linear map of the newest term stands where the Transformer was."""
+"""GRU only: a linear map of the newest frame replaces the Transformer."""
 
 from torch import Tensor, nn
 
@@ -16,7 +16,7 @@ SIZE = VELOCITY + 2 * LATENT  # as in transformer_gru
 
 
 class NewestFrame(nn.Linear):
-    """Windows (N, HISTORY, 57) -> features (N, SIZE) of their last term."""
+    """Windows (N, HISTORY, 57) -> features (N, SIZE) of their last frame."""
 
     def __init__(self) -> None:
         super().__init__(HISTORY_FRAME, SIZE)
@@ -26,7 +26,7 @@ class NewestFrame(nn.Linear):
 
 
 class GRU(LatentEstimator):
-    """Newest term -> u (131) -> e = u + f_out(GRU(u))."""
+    """Newest frame -> u (131) -> e = u + f_out(GRU(u))."""
 
     context_dim, state_dim, latent_dim = CONTEXT_MAX, SIZE, LATENT
 

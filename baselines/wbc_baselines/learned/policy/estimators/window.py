@@ -1,4 +1,4 @@
-"""The Transformer over one window of observations, of which only the last token is read out."""
+"""The Transformer over one window of observations, of which only the last token is used."""
 
 import math
 
@@ -14,7 +14,7 @@ HEAD = MODEL // HEADS
 
 
 def sinusoids(length: int, size: int) -> Tensor:
-    """Positional encodings (length, size). Source: Vaswani et al. 2017, section 3.5."""
+    """Compute positional encodings (length, size). Source: Vaswani et al. 2017, section 3.5."""
     angle = torch.arange(length)[:, None] * torch.exp(torch.arange(0, size, 2) * (-math.log(1e4) / size))
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(1)
 
@@ -42,14 +42,14 @@ class Layer(nn.Module):
         return self.norm2(x + self.narrow(self.widen(x).relu_()))
 
     def _attend(self, x: Tensor) -> Tensor:
-        """What every token gathers from all, (N, T, MODEL)."""
+        """Attention of every token to all tokens, (N, T, MODEL)."""
         query, key, value = (
             part.unflatten(-1, (HEADS, HEAD)).transpose(1, 2) for part in self.qkv(x).chunk(3, -1)
         )
         return functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
 
     def _attend_last(self, x: Tensor) -> Tensor:
-        """What the last token gathers from all, (N, 1, MODEL).
+        """Attention of the last token to all tokens, (N, 1, MODEL).
 
         Keys and values of the tokens are not formed: q . (K x) = (K^T q) . x, and the mean of V x is V times
         the mean of x. That is a sixth of the work. The bias of the keys moves all scores alike and drops out.

@@ -1,4 +1,4 @@
-"""MuJoCo's batch API: the C engine of the evaluation, on a few threads."""
+"""Training on MuJoCo's batch API, the engine of the evaluation, on several CPU threads."""
 
 from types import SimpleNamespace
 
@@ -20,7 +20,7 @@ _MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "act
 
 
 class CpuBackend:
-    """N simulations on `threads` threads; the result does not depend on how many."""
+    """N simulations on `threads` threads; the result does not depend on the number of threads."""
 
     def __init__(self, protocol: EvalProtocol, num_envs: int, threads: int) -> None:
         self.num_envs, self.device = num_envs, torch.device("cpu")

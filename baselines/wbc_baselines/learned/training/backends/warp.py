@@ -1,9 +1,9 @@
 """mujoco_warp on a GPU: thousands of simulations of the same model, in single precision.
 
-Runs on a GPU are not deterministic, so it is for training alone. Buffers are of fixed size: a world whose
-constraints overflow counts as diverged, an overflow of the contacts of all ends the run. At the start of an
-episode no contact has been solved yet, so the soles' forces are zero there, where `mujoco.batch` has those of
-its forward pass.
+Runs on a GPU are not deterministic, so this backend is for training only. Buffers have a fixed size: a world
+whose constraints overflow counts as diverged, and an overflow of the contacts of all worlds ends the run. At
+the start of an episode no contact has been solved yet, so the forces on the soles are zero there, where
+`mujoco.batch` has those of its forward pass.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ _OF_ONE = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowT
 
 
 class WarpBackend:
-    """N worlds on a GPU, or on a CPU for a test."""
+    """N worlds on a GPU, or on a CPU for tests."""
 
     def __init__(self, protocol: EvalProtocol, num_envs: int, device: str = "cuda") -> None:
         if device == "cuda" and not wp.is_cuda_available():
@@ -97,7 +97,7 @@ class WarpBackend:
         mjw.kinematics(self._m, self._d)
 
     def _launch(self, work: Callable[[], None]) -> None:
-        """Do `work`, of which a GPU keeps a graph: thousands of small kernels in one launch."""
+        """Run `work`; on a GPU as a captured graph, which launches thousands of small kernels at once."""
         if self.device.type == "cpu":
             work()
             return
