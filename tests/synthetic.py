@@ -40,6 +40,7 @@ def record(controller: str, replicate: int, frame: pd.DataFrame, **changes) -> S
     values = {
         **{"protocol": "ablation_v1", "protocol_digest": "d" * 64, "manifest_sha256": "a" * 64},
         **{"controller": controller, "controller_name": controller, "signals": ["proprioception", "ee_pose"]},
+        **{"controller_sha256": None, "resolved_controller": None},
         **{"source": "test", "replicate": replicate, "requested": len(frame), "completed": len(frame)},
         **{
             "checkpoint_sha256": None,

@@ -105,7 +105,7 @@ def test_swapped_weights_are_never_reused(tiny, tmp_path):
     other = wbc_bench.evaluate(spec, tiny, episodes=3, replicates=2, out=tmp_path / "other")
     shutil.copytree(other_run(tmp_path / "other", 1), other_run(tmp_path / "out", 1))
     assert len(other.records) == 2
-    with pytest.raises(StoreError, match="replicates 0 and 1 of .* different code or files"):
+    with pytest.raises(StoreError, match=r"replicates 0 and 1 of .* different code or files"):
         collect(ResultStore(tmp_path / "out").runs("tiny"))
     again = wbc_bench.evaluate(spec, tiny, episodes=3, replicates=1, out=tmp_path / "out", overwrite=True)
     assert not again.episodes.equals(first.episodes)

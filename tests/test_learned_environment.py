@@ -13,26 +13,27 @@ torch = pytest.importorskip("torch")
 from torch import Tensor
 
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.training.backends.base import Start
+from wbc_baselines.learned.training.backends.base import ResetState
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
-from wbc_baselines.learned.training.config import Settings, TrainingError
-from wbc_baselines.learned.training.environment import Environment, noise_half_widths, rotation_from_wxyz
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
+from wbc_baselines.learned.training.environment import Environment, noise_half_widths
 from wbc_baselines.learned.training.make import training_protocol
 from wbc_baselines.learned.training.resets import (
     DECAY,
-    FIRST_SHARES,
-    draw_pushes,
-    draw_starts,
-    shares,
-    weakened,
+    INITIAL_STRATUM_PROBABILITIES,
+    sample_episodes,
+    sample_pushes,
+    scale_disturbances,
+    stratum_probabilities,
 )
+from wbc_baselines.learned.training.state_view import rotation_from_wxyz
 from wbc_baselines.learned.training.target_set import (
-    POOLS,
-    TargetPool,
+    TARGET_SETS,
+    TargetSet,
     digest,
-    draw_pool,
-    read_pool,
-    write_pool,
+    draw_target_set,
+    read_target_set,
+    write_target_set,
 )
 from wbc_bench.episodes import randomization
 from wbc_bench.episodes.manifest import EpisodeManifest
@@ -46,7 +47,7 @@ from wbc_bench.robot import load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 
 PROTOCOL = find_protocol("ablation_v1")[0]
-POOL = read_pool(PROTOCOL)
+TARGETS = read_target_set(PROTOCOL)
 N = 6
 
 
@@ -60,21 +61,21 @@ def environment(
     protocol: EvalProtocol | None = None, count: int = N, seed: int = 0, threads: int = 1
 ) -> Environment:
     protocol = protocol or coarse()
-    return Environment(protocol, CpuBackend(protocol, count, threads), POOL, "gated", seed)
+    return Environment(protocol, CpuBackend(protocol, count, threads), TARGETS, "gated", seed)
 
 
 def actions(steps: int, count: int = N, scale: float = 0.3) -> Tensor:
     return scale * torch.randn(steps, count, 14, generator=torch.Generator().manual_seed(1))
 
 
-def manifest_of(start: Start, target: np.ndarray) -> EpisodeManifest:
+def manifest_of(start: ResetState, target: np.ndarray) -> EpisodeManifest:
     """A manifest of the same episodes as a training start's."""
     count = len(start.friction)
     columns: dict[str, Any] = {field.name: np.zeros(count) for field in fields(EpisodeManifest)}
     columns |= {name: column.numpy() for name, column in start._asdict().items()}
     columns |= {
-        "target_pos_w": POOL.pos_w[target].astype(float),
-        "target_quat_w": POOL.quat_w[target].astype(float),
+        "target_pos_w": TARGETS.pos_w[target].astype(float),
+        "target_quat_w": TARGETS.quat_w[target].astype(float),
         "push_time": np.full((count, MAX_PUSHES), np.nan),
         "push_vel": np.zeros((count, 2 * MAX_PUSHES)),
         "noise_key": np.arange(count),
@@ -84,10 +85,10 @@ def manifest_of(start: Start, target: np.ndarray) -> EpisodeManifest:
 
 def test_the_physics_is_the_evaluations():
     """The same starts and commands, 0.3 s at 2 ms x 10, through both simulations: equal but for float32."""
-    draws = draw_starts(PROTOCOL, POOL, N, stream(3, "test"))
+    samples = sample_episodes(PROTOCOL, TARGETS, N, stream(3, "test"))
     backend = CpuBackend(PROTOCOL, N, 1)
-    simulation = Simulation(PROTOCOL, manifest_of(draws.start, draws.target))
-    state = backend.reset(torch.arange(N), draws.start)
+    simulation = Simulation(PROTOCOL, manifest_of(samples.reset, samples.target))
+    state = backend.reset(torch.arange(N), samples.reset)
     robot = load_robot(PROTOCOL.robot)
     for action in actions(15):
         command = torch.tensor(robot.command_of(action.double().numpy()), dtype=torch.float32)
@@ -115,9 +116,9 @@ def test_observations_are_the_evaluations():
     env.begin_rollout(0, 4)
     for action in actions(4):
         env.step(action)
-    state, episode, seen = env._state, env._episode, env.seen
-    draws = draw_starts(PROTOCOL, POOL, N, stream(3, "test"))
-    rows = manifest_of(draws.start, draws.target)
+    state, episode, seen = env._state, env._episode, env.observations
+    samples = sample_episodes(PROTOCOL, TARGETS, N, stream(3, "test"))
+    rows = manifest_of(samples.reset, samples.target)
     rows.target_pos_w[:] = episode.target_pos_w.numpy()
     sensors = Sensors(protocol, rows, frozenset({"proprioception", "ee_pose", "privileged"}))
     from wbc_bench.evaluation.simulation import State as Truth
@@ -148,7 +149,7 @@ def test_observations_are_the_evaluations():
     np.testing.assert_allclose(seen.policy[:, : inputs.OBSERVATION].numpy(), expected, atol=2e-5)
     np.testing.assert_allclose(seen.critic[:, : inputs.OBSERVATION].numpy(), expected, atol=2e-5)
     term = np.concatenate([*common, body.joint_torque, ee9], axis=1)
-    np.testing.assert_allclose(seen.term.numpy(), term, atol=2e-5)
+    np.testing.assert_allclose(seen.frame.numpy(), term, atol=2e-5)
     target = sensors.target(truth).pos_b
     np.testing.assert_allclose(seen.policy[:, 58:61].numpy(), target, atol=2e-5)
     rot_b = np.swapaxes(truth.base_rot_w, 1, 2) @ episode.target_rot_w.double().numpy()
@@ -168,10 +169,10 @@ def test_velocities_are_differences_over_a_period():
     done = env.step(actions(12)[-1]).done
     alive = (~done).nonzero()[:, 0]
     rot_w = rotation_from_wxyz(env._state.qpos[:, 3:7])
-    velocity_w = torch.einsum("nij,nj->ni", rot_w, env._view.ee_vel_b[:, :3])
+    velocity_w = torch.einsum("nij,nj->ni", rot_w, env._derived.ee_vel_b[:, :3])
     moved = before.ee_pos_w + 0.02 * velocity_w
     torch.testing.assert_close(moved[alive], env._state.ee_pos_w[alive], atol=1e-5, rtol=0)
-    turn = 0.02 * torch.einsum("nij,nj->ni", rot_w, env._view.ee_vel_b[:, 3:])
+    turn = 0.02 * torch.einsum("nij,nj->ni", rot_w, env._derived.ee_vel_b[:, 3:])
     hat = torch.linalg.cross(turn[:, :, None].expand(-1, 3, 3), before.ee_rot_w, dim=1)
     torch.testing.assert_close((before.ee_rot_w + hat)[alive], env._state.ee_rot_w[alive], atol=0.02, rtol=0)
 
@@ -179,8 +180,8 @@ def test_velocities_are_differences_over_a_period():
 def test_starts_have_the_manifests_distribution():
     """Ranges of the protocol, filled; the resting height of each leg posture; strata by weight."""
     count, spread = 600, PROTOCOL.randomization
-    draws = draw_starts(PROTOCOL, POOL, count, stream(5, "test"))
-    start = draws.start
+    samples = sample_episodes(PROTOCOL, TARGETS, count, stream(5, "test"))
+    start = samples.reset
     for values, low, high in (
         (start.friction, *spread.friction),
         (start.base_mass, *spread.base_mass),
@@ -190,20 +191,20 @@ def test_starts_have_the_manifests_distribution():
         (start.leg_qd, -spread.leg_qd, spread.leg_qd),
         (start.kp_scale, *spread.gain),
         (start.kd_scale, *spread.gain),
-        (draws.decay, *DECAY),
+        (samples.decay, *DECAY),
     ):
         assert low <= values.min() < low + 0.02 * (high - low)
         assert high >= values.max() > high - 0.02 * (high - low)
     heights = [randomization.resting_height(PROTOCOL.robot, q) for q in start.leg_q[:5].numpy()]
     np.testing.assert_array_equal(start.base_height[:5], heights)
-    counts = np.bincount(POOL.stratum[draws.target], minlength=3)
+    counts = np.bincount(TARGETS.stratum[samples.target], minlength=3)
     assert np.all(np.abs(counts - count / 3) < 5 * np.sqrt(count * 2 / 9))
 
 
 def test_what_legs_lack_where_a_hand_is_late():
     """Both soles loaded, slow, no step needed, the reference due and the hand not there; else nothing."""
     env = environment(count=8)
-    state, episode, view = env._state, env._episode, env._view
+    state, episode, view = env._state, env._episode, env._derived
     state.qvel[:] = 0.0
     state.foot_force_w[..., 2] = 60.0
     episode.stratum[:] = STRATA.index("posture")
@@ -214,18 +215,18 @@ def test_what_legs_lack_where_a_hand_is_late():
     episode.d_ref[3] = 0.6
     view.pos_error[4] = 0.04
     episode.stratum[5] = STRATA.index("step")
-    lack = env.lack()
-    assert (lack[:6] == 0).all()
+    leg_posture_error = env.leg_posture_error()
+    assert (leg_posture_error[:6] == 0).all()
     for k in (6, 7):
-        row = np.flatnonzero((episode.target_pos_w[k].numpy() == POOL.pos_w).all(1))[0]
-        expected = POOL.witness_qpos[row, 7:15] - state.qpos[k, 7:15].numpy()
-        np.testing.assert_allclose(lack[k], expected, atol=1e-6)
+        row = np.flatnonzero((episode.target_pos_w[k].numpy() == TARGETS.pos_w).all(1))[0]
+        expected = TARGETS.witness_qpos[row, 7:15] - state.qpos[k, 7:15].numpy()
+        np.testing.assert_allclose(leg_posture_error[k], expected, atol=1e-6)
 
 
 def test_pushes_are_the_manifests():
     """One episode's draw equals the evaluation's from an equal generator."""
     for seed in range(20):
-        step, velocity = draw_pushes(PROTOCOL, 1, stream(seed, "test"))
+        step, velocity = sample_pushes(PROTOCOL, 1, stream(seed, "test"))
         time, expected = randomization.draw_pushes(
             PROTOCOL.push, PROTOCOL.episodes.horizon, stream(seed, "test")
         )
@@ -237,8 +238,8 @@ def test_pushes_are_the_manifests():
 
 def test_training_may_push_more_often():
     """As many as fit, each within the interval asked for, none in the quiet end."""
-    often = training_protocol(Settings("no_latent", push_interval=(1.5, 3.0)))
-    step, velocity = draw_pushes(often, 400, stream(1, "test"))
+    often = training_protocol(TrainConfig("no_latent", push_interval=(1.5, 3.0)))
+    step, velocity = sample_pushes(often, 400, stream(1, "test"))
     assert step.shape == (400, 6) and velocity.shape == (400, 6, 2)
     came = step >= 0
     assert set(came.sum(1)) <= {2, 3, 4, 5} and came.sum() > 3 * 400 * 0.9
@@ -247,7 +248,7 @@ def test_training_may_push_more_often():
     assert step.max() < PROTOCOL.num_steps - PROTOCOL.push.quiet_end / PROTOCOL.control_period + 1
     assert (velocity[~came] == 0).all()
     with pytest.raises(TrainingError, match=r"--push-interval 3 1\.5: valid: 0 < least <= most"):
-        Settings("no_latent", push_interval=(3.0, 1.5)).check()
+        TrainConfig("no_latent", push_interval=(3.0, 1.5)).check()
 
 
 def test_a_push_comes_at_its_step():
@@ -269,10 +270,10 @@ def test_a_push_comes_at_its_step():
 
 
 def test_curriculum_ends_at_the_protocols_weights():
-    np.testing.assert_allclose(shares(PROTOCOL, 0.0), FIRST_SHARES)
-    np.testing.assert_allclose(shares(PROTOCOL, 1.0), np.full(3, 1 / 3))
+    np.testing.assert_allclose(stratum_probabilities(PROTOCOL, 0.0), INITIAL_STRATUM_PROBABILITIES)
+    np.testing.assert_allclose(stratum_probabilities(PROTOCOL, 1.0), np.full(3, 1 / 3))
     for part in (0.0, 0.3, 1.0):
-        assert shares(PROTOCOL, part).sum() == pytest.approx(1.0)
+        assert stratum_probabilities(PROTOCOL, part).sum() == pytest.approx(1.0)
 
 
 def test_noise_is_the_protocols():
@@ -284,7 +285,7 @@ def test_noise_is_the_protocols():
     env = environment(count=64)
     env.begin_rollout(0, 1)
     env.step(torch.zeros(64, 14))
-    difference = (env.seen.policy - env.seen.critic[:, :67]).numpy()
+    difference = (env.observations.policy - env.observations.critic[:, :67]).numpy()
     noisy = np.r_[0:34, 48:57]
     assert (np.abs(difference[:, noisy]) <= half[np.r_[0:34, 48:57]] + 1e-5).all()
     assert (np.abs(difference[:, noisy]).max(0) > 0.8 * half[np.r_[0:34, 48:57]]).all()
@@ -307,11 +308,11 @@ def test_reset_touches_only_what_has_ended():
     assert not first[1].done.any()
     others = [0, 2, 3, 4, 5]
     assert ends._episode.step.tolist() == [11, 0, 11, 11, 11, 11]
-    assert (ends._episode.action[1] == 0).all() and (ends._view.ee_vel_b[1] == 0).all()
-    e_p, e_r = ends._view.pos_error[1], ends._view.rot_error[1]
+    assert (ends._episode.action[1] == 0).all() and (ends._derived.ee_vel_b[1] == 0).all()
+    e_p, e_r = ends._derived.pos_error[1], ends._derived.rot_error[1]
     assert ends._episode.d_ref[1] == 2 * e_p + e_r
     second = [env.step(torch.zeros(N, 14)) for env in (ends, goes_on)]
-    for a, b in zip(second[0].seen, second[1].seen, strict=True):
+    for a, b in zip(second[0].observations, second[1].observations, strict=True):
         torch.testing.assert_close(a[others], b[others], rtol=0, atol=0)
         assert not torch.equal(a[1], b[1])
 
@@ -351,7 +352,7 @@ def test_endings():
     log = env.log()
     assert log["episode/count"] == 3 and log["episode/diverged"] == 1
     assert log["episode/falls"] == pytest.approx(2 / 3)
-    for tensor in env.seen:
+    for tensor in env.observations:
         assert tensor.isfinite().all()
     assert not env.step(torch.zeros(N, 14)).done.any()  # the reset has cleared the engine's warning
 
@@ -364,7 +365,7 @@ def test_success_is_the_last_second_inside():
     env._episode.step[:2] = env.protocol.num_steps - 1
     env._episode.push_step.fill_(-1)
     window = env.protocol.window_steps
-    env._episode.inside[:2] = torch.tensor([window - 1, window - 2])
+    env._episode.steps_in_tolerance[:2] = torch.tensor([window - 1, window - 2])
     env._episode.target_pos_w[:2] = env._state.ee_pos_w[:2]
     env._episode.target_rot_w[:2] = env._state.ee_rot_w[:2]
     env.clear_log()
@@ -378,7 +379,7 @@ def test_threads_do_not_change_anything():
         env.begin_rollout(0, 5)
         for action in actions(5):
             env.step(action)
-    for a, b in zip(one.seen, two.seen, strict=True):
+    for a, b in zip(one.observations, two.observations, strict=True):
         assert torch.equal(a, b)
 
 
@@ -396,16 +397,16 @@ def test_save_and_load_go_on_bit_by_bit():
     for action in actions(8, scale=0.5):
         a, b = unbroken.step(action), resumed.step(action)
         assert torch.equal(a.reward, b.reward) and torch.equal(a.done, b.done)
-        for x, y in zip(a.seen, b.seen, strict=True):
+        for x, y in zip(a.observations, b.observations, strict=True):
             assert torch.equal(x, y)
 
 
 def test_the_pool_is_feasible_and_its_own():
     """What ships is equal parts, poses of unit quaternions, and shares no target with the evaluation."""
-    assert np.bincount(POOL.stratum).tolist() == [len(POOL) // 3] * 3
-    np.testing.assert_allclose(np.linalg.norm(POOL.quat_w, axis=1), 1, atol=1e-6)
-    drawn = draw_pool(PROTOCOL, 2)
-    for mine, theirs in zip(drawn, POOL, strict=True):
+    assert np.bincount(TARGETS.stratum).tolist() == [len(TARGETS) // 3] * 3
+    np.testing.assert_allclose(np.linalg.norm(TARGETS.quat_w, axis=1), 1, atol=1e-6)
+    drawn = draw_target_set(PROTOCOL, 2)
+    for mine, theirs in zip(drawn, TARGETS, strict=True):
         np.testing.assert_array_equal(mine, theirs[:2])
     from wbc_bench.episodes.manifest import manifest_path, read_manifest
 
@@ -413,7 +414,7 @@ def test_the_pool_is_feasible_and_its_own():
         *(lambda found: (found[0], manifest_path(found[1])))(find_protocol("ablation_v1"))
     )
     theirs = {hashlib.sha256(row.tobytes()).digest() for row in frozen.target_pos_w.astype(np.float32)}
-    assert not any(hashlib.sha256(row.tobytes()).digest() in theirs for row in POOL.pos_w)
+    assert not any(hashlib.sha256(row.tobytes()).digest() in theirs for row in TARGETS.pos_w)
 
 
 def test_a_witness_of_the_pool_reaches_its_target():
@@ -421,52 +422,54 @@ def test_a_witness_of_the_pool_reaches_its_target():
 
     model = load_robot(PROTOCOL.robot).model()
     data = mujoco.MjData(model)
-    for k in range(0, len(POOL), 397):
-        data.qpos[:] = POOL.witness_qpos[k]
+    for k in range(0, len(TARGETS), 397):
+        data.qpos[:] = TARGETS.witness_qpos[k]
         mujoco.mj_kinematics(model, data)
         hand = data.site("tcp")
-        np.testing.assert_allclose(hand.xpos, POOL.pos_w[k], atol=2e-3)
-        rot = matrix_from_wxyz(POOL.quat_w[k].astype(float))
+        np.testing.assert_allclose(hand.xpos, TARGETS.pos_w[k], atol=2e-3)
+        rot = matrix_from_wxyz(TARGETS.quat_w[k].astype(float))
         np.testing.assert_allclose(hand.xmat.reshape(3, 3), rot, atol=2e-3)
 
 
 def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
-    pool = TargetPool(POOL.stratum[:5], POOL.pos_w[:5], POOL.quat_w[:5], POOL.witness_qpos[:5])
-    path = tmp_path / "pool.parquet"
-    write_pool(pool, PROTOCOL, path)
-    for mine, theirs in zip(read_pool(PROTOCOL, path), pool, strict=True):
+    target_set = TargetSet(
+        TARGETS.stratum[:5], TARGETS.pos_w[:5], TARGETS.quat_w[:5], TARGETS.witness_qpos[:5]
+    )
+    path = tmp_path / "target_set.parquet"
+    write_target_set(target_set, PROTOCOL, path)
+    for mine, theirs in zip(read_target_set(PROTOCOL, path), target_set, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     narrow = msgspec.structs.replace(
         PROTOCOL, targets=msgspec.structs.replace(PROTOCOL.targets, x=(0.0, 0.1))
     )
     assert digest(narrow) != digest(PROTOCOL) == digest(coarse())
     with pytest.raises(ManifestError, match="draw it again"):
-        read_pool(narrow, path)
+        read_target_set(narrow, path)
     import pyarrow.parquet as pq
 
     old = tmp_path / "old.parquet"
     pq.write_table(pq.read_table(path).drop_columns("witness_qpos"), old)
     with pytest.raises(ManifestError, match=r"has columns stratum, pos_w, quat_w, valid: .*witness_qpos"):
-        read_pool(PROTOCOL, old)
+        read_target_set(PROTOCOL, old)
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ManifestError, match="not readable"):
-        read_pool(PROTOCOL, path)
+        read_target_set(PROTOCOL, path)
     with pytest.raises(ManifestError, match="wbc-train targets"):
-        read_pool(PROTOCOL, tmp_path / "none.parquet")
-    assert POOLS.exists() and len(STRATA) == 3
+        read_target_set(PROTOCOL, tmp_path / "none.parquet")
+    assert TARGET_SETS.exists() and len(STRATA) == 3
 
 
 def test_weakened_disturbances_lie_between_none_and_the_protocols():
     """At 0 the nominal robot of the evaluation, at 1 the protocol itself, halfway in between."""
-    assert weakened(PROTOCOL, 1.0) is PROTOCOL
+    assert scale_disturbances(PROTOCOL, 1.0) is PROTOCOL
     none = randomization.undisturbed(PROTOCOL, 0, 0)
-    draws = draw_starts(weakened(PROTOCOL, 0.0), POOL, 5, stream(3, "test"))
-    for name, value in draws.start._asdict().items():
+    samples = sample_episodes(scale_disturbances(PROTOCOL, 0.0), TARGETS, 5, stream(3, "test"))
+    for name, value in samples.reset._asdict().items():
         np.testing.assert_allclose(value, np.broadcast_to(getattr(none, name), value.shape), err_msg=name)
-    assert (draws.push_step == -1).all() and not draws.push_vel.any()
-    assert not noise_half_widths(weakened(PROTOCOL, 0.0)).any()
+    assert (samples.push_step == -1).all() and not samples.push_vel.any()
+    assert not noise_half_widths(scale_disturbances(PROTOCOL, 0.0)).any()
 
-    half, full = weakened(PROTOCOL, 0.5), PROTOCOL
+    half, full = scale_disturbances(PROTOCOL, 0.5), PROTOCOL
     np.testing.assert_allclose(noise_half_widths(half), noise_half_widths(full) / 2)
     assert half.push.speed == full.push.speed / 2 and half.push.interval == full.push.interval
     spread = half.randomization

@@ -26,7 +26,7 @@ def ee(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
 
 
 def test_dimensions_are_the_paper_s():
-    widths = (inputs.OBSERVATION, inputs.COMMAND, inputs.HISTORY, inputs.HISTORY_TERM, inputs.CONTEXT_MAX)
+    widths = (inputs.OBSERVATION, inputs.COMMAND, inputs.HISTORY, inputs.HISTORY_FRAME, inputs.CONTEXT_MAX)
     assert widths == (58, 9, 10, 57, 67)
     assert (inputs.NEXT_OBSERVATION, inputs.PRIVILEGED, inputs.ACTIONS) == (49, 80, 14)
 
@@ -36,7 +36,7 @@ def test_terms_stand_where_the_layout_says():
     found = inputs.observation(w, g, q, qd, action, ee(pos, rot), d_ref[:, 0])
     torch.testing.assert_close(found, expected(inputs.OBSERVATION_LAYOUT).expand(N, -1))
     w, g, q, qd, torque, pos, rot = numbered(inputs.HISTORY_LAYOUT)
-    found = inputs.history_term(w, g, q, qd, torque, ee(pos, rot))
+    found = inputs.history_frame(w, g, q, qd, torque, ee(pos, rot))
     torch.testing.assert_close(found, expected(inputs.HISTORY_LAYOUT).expand(N, -1))
     w, g, q, qd, pos, rot, feet = numbered(inputs.NEXT_OBSERVATION_LAYOUT)
     found = inputs.next_observation(w, g, q, qd, ee(pos, rot), feet)
@@ -55,7 +55,7 @@ def test_command_is_rho6_of_the_harness():
 
 def test_wrong_width_is_refused():
     with pytest.raises(ValueError, match=r"13 \+ 9 columns"):
-        inputs.history_term(*[torch.zeros(N, k) for k in (3, 3, 14, 14, 13, 9)])
+        inputs.history_frame(*[torch.zeros(N, k) for k in (3, 3, 14, 14, 13, 9)])
 
 
 def test_window_keeps_the_last_ten_and_refills_on_reset():

@@ -12,7 +12,7 @@ from wbc_baselines.learned.policy.methods import Reward
 from wbc_baselines.learned.policy.reference import gate
 from wbc_baselines.learned.training import rewards as r
 from wbc_baselines.learned.training.resets import DECAY
-from wbc_baselines.learned.training.target_set import read_pool
+from wbc_baselines.learned.training.target_set import read_target_set
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.robot import load_robot
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
@@ -229,7 +229,7 @@ def test_mean_gate():
 def test_the_additive_phase_is_the_schedules_mean():
     """PHASE over the targets of ablation_v1, from the default posture, with decays over their range."""
     protocol, _ = find_protocol("ablation_v1")
-    pool, robot = read_pool(protocol), load_robot()
+    targets, robot = read_target_set(protocol), load_robot()
     import mujoco
     import numpy as np
 
@@ -238,8 +238,8 @@ def test_the_additive_phase_is_the_schedules_mean():
     data.qpos[:] = [0, 0, robot.facts.nominal_base_height, 1, 0, 0, 0, *robot.default_q]
     mujoco.mj_kinematics(model, data)
     site = data.site("tcp")
-    pos = np.linalg.norm(pool.pos_w - site.xpos, axis=1)
-    rot = geodesic_angle(matrix_from_wxyz(pool.quat_w.astype(float)), site.xmat.reshape(3, 3))
+    pos = np.linalg.norm(targets.pos_w - site.xpos, axis=1)
+    rot = geodesic_angle(matrix_from_wxyz(targets.quat_w.astype(float)), site.xmat.reshape(3, 3))
     start = torch.tensor(2 * pos + rot)
     decay = torch.linspace(*DECAY, 19, dtype=torch.float64)
     mean = r.mean_gate(start[::4, None], decay[None], protocol.episodes.horizon, 250).mean()

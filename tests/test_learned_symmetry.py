@@ -11,7 +11,7 @@ from test_learned_environment import coarse
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
 from wbc_baselines.learned.training.environment import Environment
 from wbc_baselines.learned.training.symmetry import critic_mirror, input_mirror, joint_mirror
-from wbc_baselines.learned.training.target_set import TargetPool
+from wbc_baselines.learned.training.target_set import TargetSet
 from wbc_bench.robot import load_robot
 
 ROBOT = load_robot()
@@ -41,14 +41,14 @@ def one_target(side: float) -> Environment:
     quat = np.array([[w, side * x, y, side * z]], np.float32)
     pos = np.array([[0.4, 0.25 * side, 0.9]], np.float32)
     quat = (quat / np.linalg.norm(quat)).astype(np.float32)
-    pool = TargetPool(
+    targets = TargetSet(
         np.arange(3, dtype=np.int8),
         np.tile(pos, (3, 1)),
         np.tile(quat, (3, 1)),
         np.empty((3, 21), np.float32),
     )
     protocol = coarse()
-    return Environment(protocol, CpuBackend(protocol, 2, 1), pool, "gated", 0, severity=0.0)
+    return Environment(protocol, CpuBackend(protocol, 2, 1), targets, "gated", 0, disturbance_scale=0.0)
 
 
 def test_mirrored_actions_lead_to_mirrored_observations():
@@ -66,9 +66,9 @@ def test_mirrored_actions_lead_to_mirrored_observations():
         env.begin_rollout(0, 10)
     differ = False
     for _ in range(10):
-        seen, other = left.seen.policy.numpy(), right.seen.policy.numpy()
+        seen, other = left.observations.policy.numpy(), right.observations.policy.numpy()
         assert (np.abs(other - image(seen)) < tolerance).all()
-        true, truth = left.seen.critic.numpy(), right.seen.critic.numpy()
+        true, truth = left.observations.critic.numpy(), right.observations.critic.numpy()
         assert (np.abs(truth - whole(true)) < wide).all()
         differ |= bool((np.abs(other - seen) > 10 * tolerance).any())
         action = rng.normal(0.0, 0.3, (2, 14)).astype(np.float32)

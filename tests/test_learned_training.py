@@ -17,7 +17,7 @@ pytest.importorskip("rsl_rl")
 
 from mujoco.batch import Batch
 from tensordict import TensorDict
-from test_learned_environment import POOL, manifest_of
+from test_learned_environment import TARGETS, manifest_of
 
 from wbc_baselines.learned.policy import checkpoint
 from wbc_baselines.learned.policy.estimators.latent import LatentEstimator
@@ -28,14 +28,15 @@ from wbc_baselines.learned.training.backends import cpu
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
 from wbc_baselines.learned.training.campaign import campaign, is_done, runs_of, standing
 from wbc_baselines.learned.training.cli import main
-from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.curves import measured_scores, smooth, write_curves
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment
 from wbc_baselines.learned.training.make import make_environment
-from wbc_baselines.learned.training.resets import draw_starts
+from wbc_baselines.learned.training.resets import sample_episodes
+from wbc_baselines.learned.training.returns import generalized_advantages
 from wbc_baselines.learned.training.run_folder import RunFolder, run
 from wbc_baselines.learned.training.throughput import measure
-from wbc_baselines.learned.training.trainer import Trainer, advantages
+from wbc_baselines.learned.training.trainer import Trainer
 from wbc_bench.episodes.protocol import Noise, Push, find_protocol
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.evaluation import simulation
@@ -44,29 +45,29 @@ from wbc_bench.randomness import stream
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 
-TINY = Settings(
+TINY = TrainConfig(
     "no_latent",
     budget=4 * 8 * 6,
-    envs=8,
-    steps=6,
-    minibatches=2,
+    num_envs=8,
+    num_steps_per_env=6,
+    num_mini_batches=2,
     threads=1,
     estimator_share=0.5,
-    estimator_minibatches=2,
+    estimator_mini_batches=2,
     learning_rate=3e-4,
-    least_learning_rate=1e-4,
-    start="",
+    min_learning_rate=1e-4,
+    init_checkpoint="",
     teacher="",
-    critic_iterations=0,
-    calm=(0.0, 0.0),
-    posture_teaching=(0.0, 0.0),
+    critic_warmup_iterations=0,
+    disturbance_ramp=(0.0, 0.0),
+    posture_loss=(0.0, 0.0),
 )
-STEPS = TINY.envs * TINY.steps  # of an iteration
+STEPS = TINY.num_envs * TINY.num_steps_per_env  # of an iteration
 
 
 def trainer(**changes) -> Trainer:
-    settings = replace(TINY, **changes)
-    return Trainer(settings, make_environment(settings))
+    config = replace(TINY, **changes)
+    return Trainer(config, make_environment(config))
 
 
 def assert_equal(a, b, where: str = "") -> None:
@@ -91,8 +92,8 @@ def test_two_and_two_iterations_are_four(method, tmp_path):
     unbroken, broken = trainer(method=method), trainer(method=method)
     for _ in range(2):
         broken.iterate()
-    folder = RunFolder(tmp_path / broken.settings.name)
-    folder.open(broken.settings)
+    folder = RunFolder(tmp_path / broken.config.name)
+    folder.open(broken.config)
     runs.save_resume(broken, folder, 1.0)
     resumed = trainer(method=method)
     assert runs.load_resume(resumed, folder) == 1.0
@@ -115,7 +116,7 @@ def test_equal_seeds_are_equal_and_others_are_not():
 @pytest.mark.parametrize("method", ["no_latent", "oracle"])
 def test_mirror_images_double_every_minibatch(method):
     """The images of images are the samples, and PPO sees both."""
-    t = trainer(method=method, mirror=True)
+    t = trainer(method=method, symmetry_augmentation=True)
     assert t.ppo.symmetry
     augment, seen = t.ppo.symmetry.data_augmentation_func, t._observations()
     action = torch.randn(len(seen), 14)
@@ -130,22 +131,22 @@ def test_mirror_images_double_every_minibatch(method):
     t.ppo.critic.forward = lambda obs, **more: sizes.append(len(obs)) or forward(obs, **more)
     found = t.iterate()
     assert all(np.isfinite(value) for name, value in found.items() if name.startswith("loss/"))
-    assert sizes[-1] == 2 * TINY.envs * TINY.steps // TINY.minibatches
+    assert sizes[-1] == 2 * TINY.num_envs * TINY.num_steps_per_env // TINY.num_mini_batches
 
 
 def test_a_mirror_needs_inputs_that_have_one():
     with pytest.raises(
-        TrainingError, match="--mirror with --method transformer_gru: valid: no_latent, oracle"
+        TrainingError, match="--symmetry-augmentation with --method transformer_gru: valid: no_latent, oracle"
     ):
-        replace(TINY, method="transformer_gru", mirror=True).check()
+        replace(TINY, method="transformer_gru", symmetry_augmentation=True).check()
 
 
 def test_the_policys_gradient_never_reaches_the_estimator():
     """PPO's update leaves the estimator without gradient, weights as they were; and the other way round."""
     t = trainer(method="transformer_gru")
     weights = {name: value.clone() for name, value in t.estimator.state_dict().items()}
-    t.environment.begin_rollout(0, TINY.steps)
-    rollout = t._roll_out()[0]
+    t.environment.begin_rollout(0, TINY.num_steps_per_env)
+    rollout = t.collect_rollout()[0]
     assert rollout
     assert not t.ppo.storage.observations["context"].requires_grad
     with torch.no_grad():
@@ -156,7 +157,7 @@ def test_the_policys_gradient_never_reaches_the_estimator():
     mine = {id(p) for p in t.estimator.parameters()}
     assert not mine & {id(p) for group in t.ppo.optimizer.param_groups for p in group["params"]}
     policy = {name: value.clone() for name, value in t.ppo.actor.state_dict().items()}
-    t._update_estimator(rollout)
+    t.update_estimator(rollout)
     assert_equal(policy, dict(t.ppo.actor.state_dict()))
     assert any(not torch.equal(weights[name], value) for name, value in t.estimator.state_dict().items())
 
@@ -178,8 +179,8 @@ def test_the_rollout_gives_the_contexts_back(method, monkeypatch):
     monkeypatch.setattr(t, "_estimate", estimated)
     for _ in range(2):  # the second rollout begins in the middle of episodes
         contexts.clear()
-        t.environment.begin_rollout(t.iteration, TINY.steps)
-        rollout = t._roll_out()[0]
+        t.environment.begin_rollout(t.iteration, TINY.num_steps_per_env)
+        rollout = t.collect_rollout()[0]
         assert rollout and isinstance(t.estimator, LatentEstimator)
         t.iteration += 1
         t.ppo.storage.clear()
@@ -194,8 +195,8 @@ def test_the_next_observation_is_of_the_next_step():
     """Where valid, what step t's decoder is to predict is what step t + 1 begins with."""
     t = trainer(method="cenet")
     t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor([2, 4, *[100] * 6])
-    t.environment.begin_rollout(0, TINY.steps)
-    rollout = t._roll_out()[0]
+    t.environment.begin_rollout(0, TINY.num_steps_per_env)
+    rollout = t.collect_rollout()[0]
     assert rollout
     (batch,) = rollout.batches(1)
     # columns shared by the noisy term and the clean observation, up to the noise
@@ -205,7 +206,7 @@ def test_the_next_observation_is_of_the_next_step():
 
 
 def test_the_learning_rate_has_a_floor():
-    t = trainer(desired_kl=1e-9, least_learning_rate=2e-4)
+    t = trainer(desired_kl=1e-9, min_learning_rate=2e-4)
     t.iterate()
     assert t.ppo.learning_rate >= 2e-4
     assert t.ppo.optimizer.param_groups[0]["lr"] >= 2e-4
@@ -237,31 +238,31 @@ def test_noise_and_curriculum_follow_the_samples():
         found = t.iterate()
         noise.append((found["policy/std_legs"], found["policy/std_arm"]))
         ramp.append(t.environment.curriculum)
-        std = t._log_std.exp()
+        std = t.ppo.log_std.exp()
         torch.testing.assert_close(std, torch.tensor([noise[-1][0]] * 8 + [noise[-1][1]] * 6))
     np.testing.assert_allclose(noise, [(0.4, 1.0), (0.4, 1.0), (0.2, 0.1), (0.1, 0.01)])
     np.testing.assert_allclose(ramp, [0, 0.5, 1, 1])
 
 
 def test_disturbances_rise_with_the_samples():
-    t = trainer(calm=(48.0, 144.0))
-    assert t.environment.severity == 0.0
-    found = [t.iterate()["episode/severity"] for _ in range(4)]
+    t = trainer(disturbance_ramp=(48.0, 144.0))
+    assert t.environment.disturbance_scale == 0.0
+    found = [t.iterate()["episode/disturbance_scale"] for _ in range(4)]
     np.testing.assert_allclose(found, [0.0, 0.0, 0.5, 1.0])
-    assert trainer().environment.severity == 1.0
-    for calm in ((5.0, 2.0), (3.0, 3.0), (-1.0, 5.0)):
-        with pytest.raises(TrainingError, match=r"--calm .*valid: 0 <= begin"):
-            replace(TINY, calm=calm).check()
+    assert trainer().environment.disturbance_scale == 1.0
+    for ramp in ((5.0, 2.0), (3.0, 3.0), (-1.0, 5.0)):
+        with pytest.raises(TrainingError, match=r"--disturbance-ramp .*valid: 0 <= begin"):
+            replace(TINY, disturbance_ramp=ramp).check()
 
 
 def test_policy_and_critic_have_rates_of_their_own():
-    t = trainer(critic_learning_rate=7e-3, least_learning_rate=3e-3)
+    t = trainer(critic_learning_rate=7e-3, min_learning_rate=3e-3)
     t.iterate()
     rates = [group["lr"] for group in t.ppo.optimizer.param_groups]
     assert rates[0] == t.ppo.learning_rate >= 3e-3 and rates[1] == 7e-3
     mine = {id(p) for p in t.ppo.actor.parameters()}
     assert {id(p) for p in t.ppo.optimizer.param_groups[0]["params"]} == mine
-    assert t._log_std not in t.ppo.optimizer.state  # it follows the schedule alone
+    assert t.ppo.log_std not in t.ppo.optimizer.state  # it follows the schedule alone
 
 
 @pytest.mark.parametrize(
@@ -289,27 +290,27 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
     protocol, _ = find_protocol("ablation_v1")
     episodes = msgspec.structs.replace(protocol.episodes, horizon=1.0)
     protocol = msgspec.structs.replace(protocol, noise=Noise(), push=Push(), episodes=episodes)
-    env = Environment(protocol, CpuBackend(protocol, 4, 1), POOL, "gated", 7)
-    target = draw_starts(protocol, POOL, 4, stream(7, "training start", 0)).target  # what it has drawn
-    start = draw_starts(protocol, POOL, 4, stream(7, "training start", 0)).start
+    env = Environment(protocol, CpuBackend(protocol, 4, 1), TARGETS, "gated", 7)
+    target = sample_episodes(protocol, TARGETS, 4, stream(7, "training start", 0)).target  # what it has drawn
+    start = sample_episodes(protocol, TARGETS, 4, stream(7, "training start", 0)).reset
     episode = env._episode
-    episode.d_ref[:] = 2 * env._view.pos_error + env._view.rot_error
+    episode.d_ref[:] = 2 * env._derived.pos_error + env._derived.rot_error
     episode.step[:], episode.decay[:] = 0, protocol.reference_decay
 
-    env.seen = env._see()  # of a new episode
-    history, state = History(env.seen.term), torch.zeros(4, t.estimator.state_dim)
+    env.observations = env._observe()  # of a new episode
+    history, state = History(env.observations.frame), torch.zeros(4, t.estimator.state_dim)
     env.begin_rollout(0, 25)
     expected = []
     with torch.no_grad():
         for _ in range(25):
-            context = env.seen.critic[:, PRIVILEGED_COLUMNS]
+            context = env.observations.critic[:, PRIVILEGED_COLUMNS]
             if method != "oracle":
                 context, state = t.estimator.step(history.window, state)
-            groups = {"policy": env.seen.policy, "context": context}
+            groups = {"policy": env.observations.policy, "context": context}
             action = t.ppo.actor(TensorDict(groups, batch_size=[4]))
             expected.append(action)
             env.step(action)
-            history.push(env.seen.term)
+            history.push(env.observations.frame)
 
     controller = load_controller(f"learned:{path}", load_robot(protocol.robot))
     found = rollout(controller, protocol, manifest_of(start, target))
@@ -326,13 +327,13 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
 def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     """Every reward term is logged; a longer budget goes on; other settings are refused by name."""
     folder = RunFolder(tmp_path / TINY.name)
-    schedules = {"std_steps": (0.0, 150.0), "curriculum": 150.0, "calm": (48.0, 144.0)}
-    settings = replace(TINY, **schedules)  # which do not know the budget
-    run(replace(settings, budget=2 * 48), folder, tensorboard=False)
-    assert is_done(folder, replace(settings, budget=96)) and not is_done(folder, settings)
+    schedules = {"std_steps": (0.0, 150.0), "curriculum": 150.0, "disturbance_ramp": (48.0, 144.0)}
+    config = replace(TINY, **schedules)  # which do not know the budget
+    run(replace(config, budget=2 * 48), folder, tensorboard=False)
+    assert is_done(folder, replace(config, budget=96)) and not is_done(folder, config)
     with folder.metrics.open("a") as file:
         file.write('{"iteration": 3, "samp')  # as a kill would leave it
-    run(settings, folder)
+    run(config, folder)
     rows = folder.read_metrics()
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
     assert [row["samples"] for row in rows] == [48, 96, 144, 192]
@@ -349,15 +350,15 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     assert_equal(unbroken.save(), resumed.save())
     assert checkpoint.load(folder.checkpoint).card.samples == 192
     with pytest.raises(TrainingError, match=r"gamma 0\.99 -> 0\.9"):
-        run(replace(settings, gamma=0.9), folder)
+        run(replace(config, gamma=0.9), folder)
 
 
 def test_a_killed_run_resumes(tmp_path):
     """SIGKILL at any moment leaves a folder that the same command finishes."""
     code = (
         "import sys; from pathlib import Path; from wbc_baselines.learned.training import run_folder as runs;"
-        "from wbc_baselines.learned.training.config import Settings; runs.CHECKPOINT_PERIOD = 0.0;"
-        f"runs.run(Settings(**{asdict(replace(TINY, budget=1e9))}), runs.RunFolder(Path(sys.argv[1])),"
+        "from wbc_baselines.learned.training.config import TrainConfig; runs.CHECKPOINT_PERIOD = 0.0;"
+        f"runs.run(TrainConfig(**{asdict(replace(TINY, budget=1e9))}), runs.RunFolder(Path(sys.argv[1])),"
         "tensorboard=False)"
     )
     process = subprocess.Popen(
@@ -371,8 +372,8 @@ def test_a_killed_run_resumes(tmp_path):
     process.wait()
     done = len(folder.read_metrics())
     assert done >= 3 and folder.claim.exists()
-    settings = replace(TINY, budget=48 * (done + 2))
-    run(settings, folder, tensorboard=False)
+    config = replace(TINY, budget=48 * (done + 2))
+    run(config, folder, tensorboard=False)
     assert [row["iteration"] for row in folder.read_metrics()] == list(range(1, done + 3))
 
 
@@ -392,31 +393,42 @@ def test_claims(tmp_path):
     assert two.take()
 
 
+def episode_of(saved: dict) -> dict:
+    return saved["episodes"]["environment"]["episode"]
+
+
 @pytest.mark.parametrize(
-    "change", [lambda rows: rows.pop("stratum"), lambda rows: rows.update(old=torch.zeros(1))]
+    "change",
+    [
+        lambda saved: episode_of(saved).pop("stratum"),
+        lambda saved: episode_of(saved).update(old=torch.zeros(1)),
+        lambda saved: saved.update(settings=saved.pop("config")),  # as files before 0.1.0 call it
+    ],
 )
 def test_a_resume_file_of_another_version_is_one_line(tmp_path, change):
     t, folder = trainer(), RunFolder(tmp_path / TINY.name)
     folder.open(TINY)
     runs.save_resume(t, folder, 0.0)
     saved = torch.load(folder.resume)
-    change(saved["episodes"]["environment"]["episode"])
+    change(saved)
     torch.save(saved, folder.resume)
     with pytest.raises(TrainingError, match="is of another version of the code"):
         runs.load_resume(t, folder)
 
 
 def test_a_changed_run_keeps_what_it_has_learned(tmp_path):
-    """Other environments, rates and lessons: networks and counters stay, episodes are new ones."""
+    """Other environments, rates and losses: networks and counters stay, episodes are new ones."""
     folder = RunFolder(tmp_path / TINY.name)
     run(replace(TINY, budget=2 * STEPS), folder, tensorboard=False)
     before = torch.load(folder.resume)
-    other = replace(TINY, budget=2 * STEPS + 24, envs=4, learning_rate=1e-4, arm_teaching=(0.0, 1e6))
-    with pytest.raises(TrainingError, match=r"envs 8 -> 4, learning_rate 0.0003 -> 0.0001, .*or --change"):
+    other = replace(TINY, budget=2 * STEPS + 24, num_envs=4, learning_rate=1e-4, arm_ik_loss=(0.0, 1e6))
+    with pytest.raises(
+        TrainingError, match=r"num_envs 8 -> 4, learning_rate 0.0003 -> 0.0001, .*or --change"
+    ):
         folder.open(other)
     folder.open(other, change=True)
     (row,) = map(json.loads, folder.changes.read_text().splitlines())
-    assert row["samples"] == 2 * STEPS and row["changed"]["envs"] == [8, 4]
+    assert row["samples"] == 2 * STEPS and row["changed"]["num_envs"] == [8, 4]
     folder.open(other, change=True)  # nothing is new any more
     assert len(folder.changes.read_text().splitlines()) == 1
     t = Trainer(other, make_environment(other))
@@ -437,10 +449,10 @@ def test_a_changed_run_keeps_what_it_has_learned(tmp_path):
     with pytest.raises(TrainingError, match=r"seed 0 -> 1; .*but for method, seed, protocol"):
         folder.open(replace(other, seed=1), change=True)
     folder.claim.write_text("elsewhere 1")
-    files = folder.settings.read_bytes(), folder.changes.read_bytes()
+    files = folder.config.read_bytes(), folder.changes.read_bytes()
     with pytest.raises(TrainingError, match="is being trained by elsewhere"):
         run(replace(other, gamma=0.9), folder, change=True)
-    assert files == (folder.settings.read_bytes(), folder.changes.read_bytes())
+    assert files == (folder.config.read_bytes(), folder.changes.read_bytes())
 
 
 def test_what_a_kill_has_lost_is_no_longer_read(tmp_path):
@@ -500,7 +512,11 @@ def test_the_scores_are_means_where_their_gate_is_open():
 
 @pytest.mark.parametrize(
     ("changes", "words"),
-    [({"envs": 0}, "--envs 0"), ({"minibatches": 49}, "1 to 48"), ({"estimator_minibatches": 5}, "1 to 4")],
+    [
+        ({"num_envs": 0}, "--num-envs 0"),
+        ({"num_mini_batches": 49}, "1 to 48"),
+        ({"estimator_mini_batches": 5}, "1 to 4"),
+    ],
 )
 def test_impossible_settings_are_refused(changes, words):
     with pytest.raises(TrainingError, match=words):
@@ -516,14 +532,35 @@ def test_mistakes_name_the_valid_values():
 
 def test_the_command_line(tmp_path, capsys, monkeypatch):
     """`wbc-train run`, changed, a campaign, `status`; a mistake is one line and code 2."""
-    options = ["--budget", "4.8e1", "--envs", "8", "--steps", "6", "--minibatches", "2", "--threads", "1"]
+    options = [
+        "--budget",
+        "4.8e1",
+        "--num-envs",
+        "8",
+        "--num-steps-per-env",
+        "6",
+        "--num-mini-batches",
+        "2",
+        "--threads",
+        "1",
+    ]
     options += ["--estimator-share", "0.5", "--out", str(tmp_path)]
 
     def interrupted(_):
         raise KeyboardInterrupt
 
     main(["run", "--method", "no_latent", *options])
-    more = ["run", "--method", "no_latent", *options, "--budget", "9.6e1", "--epochs", "1", "--change"]
+    more = [
+        "run",
+        "--method",
+        "no_latent",
+        *options,
+        "--budget",
+        "9.6e1",
+        "--num-learning-epochs",
+        "1",
+        "--change",
+    ]
     with monkeypatch.context() as patched:
         patched.setattr(Trainer, "iterate", interrupted)
         with pytest.raises(SystemExit):
@@ -543,29 +580,32 @@ def test_the_command_line(tmp_path, capsys, monkeypatch):
 
 
 def test_advantages_by_hand():
-    """Sums of discounted surprises, that end with an episode, and before a push."""
+    """Sums of discounted TD errors, that end with an episode, and before a push."""
     rewards = torch.tensor([[1.0], [2.0], [3.0]])
     values = torch.tensor([[10.0], [20.0], [30.0], [40.0]])
     no = torch.zeros(3, 1, dtype=torch.bool)
-    # surprises with gamma 0.5: 1 + 10 - 10 = 1, 2 + 15 - 20 = -3, 3 + 20 - 30 = -7; factor 0.5 * 0.8 = 0.4
-    found = advantages(rewards, values, no, no, 0.5, 0.8)
+    # deltas with gamma 0.5: 1 + 10 - 10 = 1, 2 + 15 - 20 = -3, 3 + 20 - 30 = -7; factor 0.5 * 0.8 = 0.4
+    found = generalized_advantages(rewards, values, no, no, 0.5, 0.8)
     assert found[:, 0].tolist() == pytest.approx([1 + 0.4 * (-3 + 0.4 * -7), -3 + 0.4 * -7, -7])
     done = torch.tensor([[False], [True], [False]])  # at 1: 2 - 20 = -18, and nothing from 2 on
-    assert advantages(rewards, values, done, no, 0.5, 0.8)[:, 0].tolist() == pytest.approx(
+    assert generalized_advantages(rewards, values, done, no, 0.5, 0.8)[:, 0].tolist() == pytest.approx(
         [1 + 0.4 * -18, -18, -7]
     )
     pushed = torch.tensor([[False], [True], [False]])
-    assert advantages(rewards, values, no, pushed, 0.5, 0.8)[:, 0].tolist() == pytest.approx([1, 0, -7])
+    assert generalized_advantages(rewards, values, no, pushed, 0.5, 0.8)[:, 0].tolist() == pytest.approx(
+        [1, 0, -7]
+    )
 
 
 def test_advantages_without_pushes_are_rsl_rls():
     """A second implementation: with one lambda and no push the two agree; the critic's targets always do."""
-    one = trainer(push_interval=(50.0, 60.0), policy_lam=0.95)
-    ends = trainer(push_interval=(50.0, 60.0), policy_lam=0.5)
+    one = trainer(push_interval=(50.0, 60.0), actor_lam=0.95)
+    ends = trainer(push_interval=(50.0, 60.0), actor_lam=0.5)
     for each in (one, ends):
         torch.manual_seed(0)
-        each.environment.begin_rollout(0, each.settings.steps)
-        each._judge(each._roll_out()[1])
+        each.environment.begin_rollout(0, each.config.num_steps_per_env)
+        _, pushed = each.collect_rollout()
+        each.ppo.compute_advantages(each._observations(), pushed)
     storage = one.ppo.storage
     expected = storage.returns - storage.values
     torch.testing.assert_close(storage.advantages, (expected - expected.mean()) / (expected.std() + 1e-8))
@@ -574,8 +614,8 @@ def test_advantages_without_pushes_are_rsl_rls():
 
 
 def test_the_bench_times_the_engine_and_leaves_it_as_it_was():
-    settings = replace(TINY, start="oracle@0")
-    fast, slow = measure(settings, ("no_latent", "cenet"), rounds=2, episodes=2)
+    config = replace(TINY, init_checkpoint="oracle@0")
+    fast, slow = measure(config, ("no_latent", "cenet"), rounds=2, episodes=2)
     for found in (fast, slow):
         assert 0.0 < found.training < 1.0
         assert found.training == pytest.approx(found.steps / found.physics)  # of a single round

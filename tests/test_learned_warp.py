@@ -6,11 +6,11 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("mujoco_warp")
 
-from wbc_baselines.learned.training.backends.base import Start
+from wbc_baselines.learned.training.backends.base import ResetState
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
 from wbc_baselines.learned.training.backends.warp import WarpBackend
-from wbc_baselines.learned.training.resets import draw_starts
-from wbc_baselines.learned.training.target_set import read_pool
+from wbc_baselines.learned.training.resets import sample_episodes
+from wbc_baselines.learned.training.target_set import read_target_set
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.randomness import stream
 from wbc_bench.robot import load_robot
@@ -20,12 +20,12 @@ PROTOCOL = find_protocol("ablation_v1")[0]
 
 def test_the_back_ends_agree_over_a_third_of_a_second():
     """Two robots with their own mass, friction and gains, onto the ground, 15 steps of 2 ms x 10."""
-    draws = draw_starts(PROTOCOL, read_pool(PROTOCOL), 2, stream(4, "test"))
+    draws = sample_episodes(PROTOCOL, read_target_set(PROTOCOL), 2, stream(4, "test"))
     start = draws.start._replace(leg_q=0.2 * draws.start.leg_q)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     cpu, warp = CpuBackend(PROTOCOL, 2, 1), WarpBackend(PROTOCOL, 2, device)
     first = [
-        b.reset(torch.arange(2, device=b.device), Start(*(column.to(b.device) for column in start)))
+        b.reset(torch.arange(2, device=b.device), ResetState(*(column.to(b.device) for column in start)))
         for b in (cpu, warp)
     ]
     np.testing.assert_allclose(first[0].torque, first[1].torque.cpu(), atol=1e-4)

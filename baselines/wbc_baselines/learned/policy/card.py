@@ -1,7 +1,7 @@
-"""The card of a checkpoint: what a policy is, where it comes from, and the robot that it was trained for.
+"""The card of a checkpoint: the policy's method, its training, and the robot that it was trained for.
 
-Everything on the card is checked when a checkpoint is loaded: transfers fail in silence where joint order,
-gains, limits, default posture or end-effector frame of the robot are not those of the training.
+The card is checked whenever a checkpoint is loaded, because a policy fails silently if joint order, gains,
+limits, default posture or end-effector frame of the robot differ from those of the training.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ class CheckpointError(BenchError):
 
 
 class RobotFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What of robot and protocol a policy depends on; per joint in `joints` order."""
+    """The properties of robot and protocol that a policy depends on; joint values in `joints` order."""
 
     joints: tuple[str, ...]
     default_q: Numbers  # [rad]
@@ -47,19 +47,19 @@ class RobotFacts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Dimensions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Columns of inputs and outputs."""
+    """Numbers of columns of the inputs and outputs."""
 
     observation: int
     command: int
     history: int  # control steps
-    history_term: int
+    history_frame: int = msgspec.field(name="history_term")
     context: int
     state: int
     actions: int
 
 
-class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a checkpoint is and where it comes from."""
+class PolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The identity and origin of a checkpoint. The JSON file keeps the first names of renamed fields."""
 
     format: int
     method: str
@@ -75,13 +75,14 @@ class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     git_commit: str | None
     git_dirty: bool
     dimensions: Dimensions
-    start: str = ""  # name and SHA-256 of the checkpoint that it began with
-    teacher: str = ""  # and of the one that it imitated at first
+    # name and SHA-256 of the checkpoint that initialized it, and of the one it was distilled from
+    init_checkpoint: str = msgspec.field(default="", name="start")
+    teacher: str = ""
     sha256: str = ""  # of the safetensors file
 
 
 def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
-    """The facts of a robot that is commanded every `control_period` [s]."""
+    """Collect the facts of a robot that is commanded every `control_period` [s]."""
     facts, tcp = robot.facts, tcp_of(robot.facts, robot.config)
     mount = mount_of(facts, robot.config)
     bodies = [facts.base, facts.fixed, facts.foot, facts.links, facts.joints, mount.lumps]
@@ -102,10 +103,10 @@ def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
 
 
 def conditions(protocol: EvalProtocol) -> dict[str, Any]:
-    """What episodes of a protocol are like: `section.field` by value, as JSON holds it.
+    """Collect the conditions of a protocol's episodes, `section.field` by value, in the types of JSON.
 
-    Left out is what no policy meets (names, counts, seed, the rule of success), what `RobotFacts` holds, and
-    the physics step, which is longer in training than in any evaluation.
+    Properties that no policy can notice are left out (names, counts, seed, the rule of success), as are those
+    in `RobotFacts`, and the physics step, which is longer in training than in any evaluation.
     """
     sections = msgspec.to_builtins(protocol)
     for name in ("name", "description", "success", "robot", "physics"):
@@ -120,8 +121,8 @@ def conditions(protocol: EvalProtocol) -> dict[str, Any]:
     return msgspec.json.decode(msgspec.json.encode(found))
 
 
-def other_conditions(card: Card, protocol: EvalProtocol) -> str:
-    """`field: trained X, here Y` of every condition of a protocol that differs from the training's."""
+def other_conditions(card: PolicyCard, protocol: EvalProtocol) -> str:
+    """Describe all conditions of a protocol that differ from the training, `field: trained X, here Y`."""
     trained, here, lines = card.conditions, conditions(protocol), []
     names, kind = trained.keys() | here.keys(), "targets.type"
     if trained.get(kind) != here[kind]:  # then the other fields of targets have nothing in common
@@ -133,11 +134,22 @@ def other_conditions(card: Card, protocol: EvalProtocol) -> str:
     return "; ".join(lines)
 
 
-def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> Card:
-    """The card of a policy trained here, by this code: control steps and wall time [s] it took."""
+def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: EvalProtocol) -> PolicyCard:
+    """Create the card of a policy that this code has trained.
+
+    Args:
+        method: Method of the study.
+        seed: Seed of the training.
+        samples: Control steps of the training.
+        wall_time: Duration of the training [s].
+        protocol: Protocol of the training.
+
+    Returns:
+        The card, without the digest of the weights.
+    """
     facts = robot_facts(load_robot(protocol.robot), protocol.control_period)
     commit, dirty = provenance.commit()
-    return Card(
+    return PolicyCard(
         format=FORMAT,
         method=method,
         seed=seed,
@@ -155,10 +167,18 @@ def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: E
     )
 
 
-def read_card(path: Path) -> Card:
-    """The card beside a safetensors file, itself whole and of a method and dimensions that exist here.
+def read_card(path: Path) -> PolicyCard:
+    """Read and check the card beside a safetensors file.
 
-    Raises: CheckpointError, UnknownNameError.
+    Args:
+        path: The safetensors file.
+
+    Returns:
+        The card, of a method and dimensions that exist here.
+
+    Raises:
+        CheckpointError: A file is missing, or the card is damaged or of other dimensions.
+        UnknownNameError: There is no such method.
     """
     beside = card_path(path)
     for file in (path, beside):
@@ -167,13 +187,25 @@ def read_card(path: Path) -> Card:
     return decode_card(beside.read_bytes(), str(beside))
 
 
-def decode_card(text: bytes, where: str) -> Card:
-    """The card of a JSON text. Raises: CheckpointError, UnknownNameError."""
+def decode_card(text: bytes, where: str) -> PolicyCard:
+    """Decode and check a card.
+
+    Args:
+        text: JSON text.
+        where: Name of its file, for error messages.
+
+    Returns:
+        The card, of a method and dimensions that exist here.
+
+    Raises:
+        CheckpointError: The card is damaged, altered, or of another format or other dimensions.
+        UnknownNameError: There is no such method.
+    """
     try:
         version = msgspec.json.decode(text, type=_Version).format
         if version != FORMAT:
             raise CheckpointError(f"checkpoint card '{where}' has format {version}, valid: {FORMAT}")
-        card = msgspec.json.decode(text, type=Card)
+        card = msgspec.json.decode(text, type=PolicyCard)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise CheckpointError(f"checkpoint card '{where}' cannot be read: {error}") from error
     if card.method not in METHODS:
@@ -186,8 +218,18 @@ def decode_card(text: bytes, where: str) -> Card:
     return card
 
 
-def check_fit(card: Card, robot: Robot | None, control_period: float | None, where: str) -> None:
-    """Raises: CheckpointError with every field in which robot or control period [s] differ from training."""
+def check_fit(card: PolicyCard, robot: Robot | None, control_period: float | None, where: str) -> None:
+    """Check that a policy fits a robot and a control period.
+
+    Args:
+        card: Card of the policy.
+        robot: Robot to control; None to leave it unchecked.
+        control_period: Control period [s]; None to leave it unchecked.
+        where: Name of the checkpoint, for error messages.
+
+    Raises:
+        CheckpointError: Robot or control period differ from the training; all differing fields are listed.
+    """
     period = card.robot.control_period if control_period is None else control_period
     here = robot_facts(robot, period) if robot else msgspec.structs.replace(card.robot, control_period=period)
     if differences := _differences(card.robot, here):
@@ -195,7 +237,7 @@ def check_fit(card: Card, robot: Robot | None, control_period: float | None, whe
 
 
 def card_path(path: Path) -> Path:
-    """Where the card of a safetensors file stands: beside it."""
+    """Return the path of the card of a safetensors file, which is stored beside it."""
     return path.with_suffix(".json")
 
 
@@ -208,7 +250,7 @@ def _dimensions(estimator: Estimator) -> Dimensions:
         observation=inputs.OBSERVATION,
         command=inputs.COMMAND,
         history=inputs.HISTORY,
-        history_term=inputs.HISTORY_TERM,
+        history_frame=inputs.HISTORY_FRAME,
         context=estimator.context_dim,
         state=estimator.state_dim,
         actions=inputs.ACTIONS,

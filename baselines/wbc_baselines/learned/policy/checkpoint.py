@@ -1,4 +1,4 @@
-"""Checkpoints: weights and normalisers as safetensors, and a card (`card`) beside them."""
+"""Checkpoints: weights and normalizers as safetensors, with a card (see `card`) beside them."""
 
 import hashlib
 from collections.abc import Iterable
@@ -12,7 +12,7 @@ from safetensors.torch import load as tensors_of
 from safetensors.torch import save as bytes_of
 
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.card import Card, CheckpointError, card_path, check_fit, read_card
+from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, card_path, check_fit, read_card
 from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.networks import Actor
@@ -27,13 +27,20 @@ CHECKPOINTS = Path(__file__).parents[1] / "checkpoints"  # METHOD@SEED.safetenso
 class Checkpoint(NamedTuple):
     """A loaded checkpoint."""
 
-    card: Card
+    card: PolicyCard
     actor: Actor
     estimator: Estimator
 
 
-def save(path: Path, actor: Actor, estimator: Estimator, card: Card) -> None:
-    """Write PATH.safetensors and its card; a card never stands beside weights that are not its own."""
+def save(path: Path, actor: Actor, estimator: Estimator, card: PolicyCard) -> None:
+    """Write a checkpoint and its card, which contains the digest of the weights.
+
+    Args:
+        path: PATH.safetensors.
+        actor: Policy network.
+        estimator: Estimator of its context.
+        card: Card without the digest.
+    """
     tensors = {f"actor.{name}": value for name, value in actor.state_dict().items()}
     tensors |= {f"estimator.{name}": value for name, value in estimator.state_dict().items()}
     data = bytes_of({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
@@ -45,14 +52,23 @@ def save(path: Path, actor: Actor, estimator: Estimator, card: Card) -> None:
 
 
 def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None = None) -> Checkpoint:
-    """The checkpoint of a file, fit for a robot and a protocol where they are given.
+    """Load a checkpoint and check it.
 
-    Protocols may differ in targets, noise, randomisation, pushes and physics step: a policy is evaluated
-    under many. Robot and control period must be those of the training.
+    A policy may be evaluated with other targets, noise, randomization, pushes and physics steps than those of
+    its training. Robot and control period must be the same.
+
+    Args:
+        path: PATH.safetensors.
+        robot: Robot to control; None to leave it unchecked.
+        protocol: Protocol whose robot and control period are checked; None to leave them unchecked.
+
+    Returns:
+        Card and networks in evaluation mode.
 
     Raises:
-        CheckpointError: missing, truncated or altered file, other dimensions, robot or control period.
-        UnknownNameError: a method that does not exist.
+        CheckpointError: A file is missing, truncated or altered, or dimensions, robot or control period
+            differ.
+        UnknownNameError: There is no such method.
     """
     card = read_card(path)
     data = path.read_bytes()
@@ -76,36 +92,61 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
 
 
 def identity(name: str) -> str:
-    """Name and SHA-256 of a checkpoint's weights, for the card of one that comes from it; "" of no name."""
+    """Return name and SHA-256 of a checkpoint, for the cards of those trained from it; "" for no name."""
     return f"{find(name).stem} {read_card(find(name)).sha256}" if name else ""
 
 
-def load_start(name: str, estimator: str) -> Checkpoint:
-    """A checkpoint that a method with this estimator can begin with; see `shared_context`.
+def load_init_checkpoint(name: str, estimator: str) -> Checkpoint:
+    """Load a checkpoint that can initialize a method with this estimator, see `shared_context`.
 
-    Raises: CheckpointError, its estimator is a third one; and see `load`.
+    Args:
+        name: METHOD@SEED or PATH.safetensors.
+        estimator: Name of the estimator of the method to train.
+
+    Returns:
+        The checkpoint.
+
+    Raises:
+        CheckpointError: It has a different estimator; and see `load`.
+        UnknownNameError: There is no such checkpoint.
     """
     found = load(find(name))
     theirs = METHODS[found.card.method]
     if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(
-            f"--start '{name}' is of {found.card.method}, valid: a method without a context, the oracle, "
-            f"or a method with the estimator '{estimator}'"
+            f"--init-checkpoint '{name}' is of {found.card.method}, valid: a method without a context, "
+            f"the oracle, or a method with the estimator '{estimator}'"
         )
     return found
 
 
-def shared_context(start: Estimator, mine: Estimator) -> int:
-    """First columns of the context that mean the same in two policies: all, or the velocity, or none."""
-    if type(start) is type(mine):
+def shared_context(init: Estimator, mine: Estimator) -> int:
+    """Count the first context columns with the same meaning in two policies: all, the velocity, or none.
+
+    Args:
+        init: Estimator of the checkpoint.
+        mine: Estimator of the method to train.
+
+    Returns:
+        Number of shared columns.
+    """
+    if type(init) is type(mine):
         return mine.context_dim
-    return inputs.VELOCITY if start.context_dim and mine.trainable else 0
+    return inputs.VELOCITY if init.context_dim and mine.trainable else 0
 
 
 def load_teacher(name: str) -> Checkpoint:
-    """A checkpoint whose answer to a state does not depend on those before it.
+    """Load a checkpoint whose action depends on the current state only.
 
-    Raises: CheckpointError, its context is estimated; and see `load`.
+    Args:
+        name: METHOD@SEED or PATH.safetensors.
+
+    Returns:
+        The checkpoint.
+
+    Raises:
+        CheckpointError: Its context is estimated from a history; and see `load`.
+        UnknownNameError: There is no such checkpoint.
     """
     found = load(find(name))
     if found.estimator.trainable:
@@ -116,9 +157,16 @@ def load_teacher(name: str) -> Checkpoint:
 
 
 def find(name: str) -> Path:
-    """The file of `METHOD@SEED` among the checkpoints of this package, or of `PATH.safetensors`.
+    """Find the file of a checkpoint.
 
-    Raises: UnknownNameError, no such checkpoint (with the nearest names).
+    Args:
+        name: METHOD@SEED of a checkpoint of this package, or PATH.safetensors.
+
+    Returns:
+        The safetensors file.
+
+    Raises:
+        UnknownNameError: There is no such checkpoint; the nearest names are listed.
     """
     if name.endswith(".safetensors"):
         return Path(name)
@@ -133,7 +181,7 @@ def find(name: str) -> Path:
 
 
 def available() -> list[str]:
-    """Names METHOD@SEED of the checkpoints of this package."""
+    """List the checkpoints of this package as METHOD@SEED."""
     return sorted(path.stem for path in CHECKPOINTS.glob("*@*.safetensors"))
 
 

@@ -1,4 +1,4 @@
-"""A trained policy as a controller of the bench: batched, deterministic, on one thread."""
+"""Trained policies as controllers of the benchmark: batched, deterministic, on one thread."""
 
 import warnings
 from pathlib import Path
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wbc_baselines.learned.policy import checkpoint, inputs
-from wbc_baselines.learned.policy.card import Card, CheckpointError, check_fit, other_conditions
+from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, check_fit, other_conditions
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.onnx_engine import OnnxEngine
 from wbc_baselines.learned.policy.policy import Flow, Policy
@@ -28,7 +28,7 @@ REFERENCE_DECAY = 1.0  # [1/s] where no protocol says otherwise. Source: default
 
 
 class Engine(Protocol):
-    """What computes a policy: torch or an exported file."""
+    """The implementation that computes a policy: torch, or a runtime of exported files."""
 
     flow: Flow
 
@@ -36,10 +36,10 @@ class Engine(Protocol):
 
 
 class LearnedController:
-    """Puts together what a policy reads, remembers what it must, and scales what it answers.
+    """Assembles the inputs of a policy, keeps its window and recurrent state, and scales its actions.
 
-    float32; latent and action are means. Rows do not see each other, but a matrix product may round
-    differently for another number of rows: the same shard gives the same bits, another size agrees to 1e-5.
+    All values are float32; latent and action are means. Rows are independent, but a matrix product may round
+    differently for another number of rows: the same shard is computed bit-equal, other sizes agree to 1e-5.
     """
 
     formats = ("onnx",)
@@ -47,7 +47,7 @@ class LearnedController:
     def __init__(
         self,
         robot: Robot,
-        card: Card,
+        card: PolicyCard,
         engine: Engine,
         name: str,
         sha256: str,
@@ -65,9 +65,13 @@ class LearnedController:
         self._default_q = _tensor(robot.default_q)
 
     def prepare(self, protocol: EvalProtocol) -> None:
-        """Take the decay of the reference from the protocol; warn of conditions other than the training's.
+        """Take the decay of the reference from a protocol, and warn if its conditions differ from training.
 
-        Raises: CheckpointError, see `check_fit`.
+        Args:
+            protocol: Protocol of the evaluation.
+
+        Raises:
+            CheckpointError: Robot or control period differ from the training, see `check_fit`.
         """
         check_fit(self.card, self._robot, protocol.control_period, self.info.name)
         if differences := other_conditions(self.card, protocol):
@@ -78,7 +82,7 @@ class LearnedController:
 
     @torch.inference_mode()
     def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
-        """Windows of the first observation, state and action zero, reference from the observed pose."""
+        """Fill the windows with the first observation, and start with zero state and action."""
         assert obs.ee_pose is not None
         pos, rot6 = _tensor(obs.ee_pose.pos_b), _tensor(obs.ee_pose.rot6_b)
         errors = pose_errors(pos, rotation_from_rho6(rot6), _tensor(target.pos_b), _tensor(target.rot_b))
@@ -87,7 +91,7 @@ class LearnedController:
         self._action = torch.zeros(count, inputs.ACTIONS)
         self._carried: dict[str, Tensor] = {}
         if "window" in flow:
-            self._carried["window"] = inputs.history_term(*self._measured(obs))[:, None].repeat(
+            self._carried["window"] = inputs.history_frame(*self._measured(obs))[:, None].repeat(
                 1, inputs.HISTORY, 1
             )
         if "state" in flow:
@@ -95,7 +99,7 @@ class LearnedController:
 
     @torch.inference_mode()
     def act(self, obs: Observation, target: Target) -> JointCommand:
-        """The commands of one control step."""
+        """Compute the commands of one control step."""
         if not self._first:
             self._d_ref = advance(self._d_ref, self._decay, self.info.control_period)
         self._first = False
@@ -109,7 +113,7 @@ class LearnedController:
             **self._carried,
         }
         if "term" in self._engine.flow.inputs:
-            values["term"] = inputs.history_term(*measured)
+            values["term"] = inputs.history_frame(*measured)
         if "privileged" in self._engine.flow.inputs:
             values["privileged"] = _privileged(obs)
         found = self._engine(values)
@@ -118,9 +122,13 @@ class LearnedController:
         return JointCommand(self._robot.command_of(self._action.numpy().astype(np.float64)))
 
     def latent(self) -> NDArray[np.float64]:
-        """The dynamics latent (N, 64; 16 of cenet) behind the latest commands; the velocity is left out.
+        """Return the dynamics latent of the latest commands, without the estimated velocity.
 
-        Raises: CheckpointError, the method has no estimator or the policy is an exported one.
+        Returns:
+            Latents (N, 64), or (N, 16) for cenet.
+
+        Raises:
+            CheckpointError: The method has no estimator, or the policy is an exported one.
         """
         if self._latent is None:
             shown = ", ".join(name for name, method in METHODS.items() if method.estimates)
@@ -130,7 +138,15 @@ class LearnedController:
         return self._latent.numpy().astype(np.float64)
 
     def export(self, path: Path, format: str) -> None:
-        """Write the policy as ONNX. Raises: CheckpointError, it comes from such a file already."""
+        """Write the policy as an ONNX file.
+
+        Args:
+            path: File to write.
+            format: Name of the format; there is only `onnx`.
+
+        Raises:
+            CheckpointError: The policy comes from an exported file already.
+        """
         if not isinstance(self._engine, Policy):
             raise CheckpointError(f"'{self.info.name}' is an exported policy already")
         from wbc_baselines.learned.policy.export import write_onnx
@@ -146,7 +162,19 @@ class LearnedController:
 
 
 def from_checkpoint(robot: Robot, variant: str) -> LearnedController:
-    """The controller of `METHOD@SEED` or of `PATH.safetensors`. Raises: CheckpointError, UnknownNameError."""
+    """Create the controller of a checkpoint.
+
+    Args:
+        robot: Robot to control.
+        variant: METHOD@SEED or PATH.safetensors.
+
+    Returns:
+        The controller.
+
+    Raises:
+        CheckpointError: The checkpoint is damaged or does not fit the robot.
+        UnknownNameError: There is no such checkpoint.
+    """
     path = checkpoint.find(variant)
     card, actor, estimator = checkpoint.load(path, robot)
     name = f"learned:{card.method}@{card.seed}"
@@ -171,7 +199,19 @@ def _privileged(obs: Observation) -> Tensor:
 
 
 def from_onnx(robot: Robot, variant: str) -> LearnedController:
-    """The controller of `onnx:FILE`. Raises: CheckpointError, UnknownNameError."""
+    """Create the controller of an exported policy.
+
+    Args:
+        robot: Robot to control.
+        variant: ONNX file.
+
+    Returns:
+        The controller.
+
+    Raises:
+        CheckpointError: The file is damaged or does not fit the robot.
+        UnknownNameError: There is no such method.
+    """
     engine = OnnxEngine(Path(variant))
     check_fit(engine.card, robot, None, variant)
     return LearnedController(robot, engine.card, engine, f"onnx:{variant}", engine.sha256, (Path(variant),))

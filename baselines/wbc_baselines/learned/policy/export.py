@@ -1,6 +1,7 @@
-"""Policies as ONNX files: window and recurrent state are explicit inputs and outputs, normalisers are inside.
+"""Export of policies as ONNX files, with window and recurrent state as explicit inputs and outputs.
 
-The checkpoint's card travels in the file, so that `onnx:FILE` is checked against the robot like a checkpoint.
+The normalizers are part of the graph. The file contains the checkpoint's card, so that `onnx:FILE` is checked
+against the robot like a checkpoint.
 """
 
 import tempfile
@@ -12,14 +13,14 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from wbc_baselines.learned.policy.card import Card
+from wbc_baselines.learned.policy.card import PolicyCard
 from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, _output
 from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.files import write_atomic
 
 
 class _Positional(nn.Module):
-    """A policy whose inputs and outputs are in the order of its flow, as the exporter wants them."""
+    """A policy with positional inputs and outputs in the order of its flow, as the exporter requires."""
 
     def __init__(self, policy: Policy) -> None:
         super().__init__()
@@ -31,11 +32,17 @@ class _Positional(nn.Module):
         return tuple(found[name] for name in flow.outputs)
 
 
-def write_onnx(path: Path, policy: Policy, card: Card) -> None:
-    """Write a policy and its card; the batch is free."""
+def write_onnx(path: Path, policy: Policy, card: PolicyCard) -> None:
+    """Write a policy and its card, with a variable batch size.
+
+    Args:
+        path: ONNX file to write.
+        policy: Policy to export.
+        card: Card of its checkpoint.
+    """
     flow = policy.flow
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        # of torch's two exporters the one that traces is deprecated, and needs no further package
+        # torch's tracing exporter is deprecated, but the other one needs a further package
         warnings.simplefilter("ignore", DeprecationWarning)
         raw = Path(folder) / "policy.onnx"
         torch.onnx.export(
@@ -43,7 +50,7 @@ def write_onnx(path: Path, policy: Policy, card: Card) -> None:
             tuple(torch.zeros(2, *shape) for shape in flow.inputs.values()),
             str(raw),
             input_names=list(flow.inputs),
-            # an output cannot be called as an input is
+            # an output cannot have the name of an input
             output_names=[_output(name) for name in flow.outputs],
             dynamic_axes={name: {0: "batch"} for name in (*flow.inputs, *map(_output, flow.outputs))},
             opset_version=OPSET,

@@ -1,6 +1,6 @@
-"""Every input of policy, critic and estimators: what stands in which column, and how it is put together.
+"""The inputs of policy, critic and estimators: the meaning of every column, and their assembly.
 
-The layouts below are the only place that knows a dimension; `wbc-bench list --inputs` prints them.
+The layouts below are the only definition of the dimensions; `wbc-bench list --inputs` prints them.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # the table is printed where torch is not installed
 
 
 class Term(NamedTuple):
-    """Some neighbouring columns of a vector."""
+    """Adjacent columns of a vector."""
 
     name: str
     size: int
@@ -62,12 +62,23 @@ PRIVILEGED_LAYOUT: Layout = (  # Source: paper, section III-A, what the critic a
 
 
 def width(layout: Layout) -> int:
-    """Columns of a layout."""
+    """Count the columns of a layout."""
     return sum(term.size for term in layout)
 
 
 def columns(layout: Layout, term: str) -> slice:
-    """Where the first term whose name begins so stands in a vector of the layout."""
+    """Find the columns of a term.
+
+    Args:
+        layout: Layout of the vector.
+        term: Beginning of the term's name.
+
+    Returns:
+        Columns of the first term that matches.
+
+    Raises:
+        KeyError: There is no such term.
+    """
     start = 0
     for each in layout:
         if each.name.startswith(term):
@@ -78,7 +89,7 @@ def columns(layout: Layout, term: str) -> slice:
 
 OBSERVATION = width(OBSERVATION_LAYOUT)
 COMMAND = width(COMMAND_LAYOUT)
-HISTORY_TERM = width(HISTORY_LAYOUT)
+HISTORY_FRAME = width(HISTORY_LAYOUT)
 NEXT_OBSERVATION = width(NEXT_OBSERVATION_LAYOUT)
 PRIVILEGED = width(PRIVILEGED_LAYOUT)
 VELOCITY, LATENT = 3, 64  # of the context z = (v, xi). Source: paper, Table I
@@ -90,21 +101,21 @@ CONTEXT_LAYOUT: Layout = (
     ),
 )
 # Source: paper, Table I and section III
-assert (OBSERVATION, COMMAND, HISTORY_TERM, NEXT_OBSERVATION, CONTEXT_MAX) == (58, 9, 57, 49, 67)
+assert (OBSERVATION, COMMAND, HISTORY_FRAME, NEXT_OBSERVATION, CONTEXT_MAX) == (58, 9, 57, 49, 67)
 assert PRIVILEGED == 80
 
 LAYOUTS: dict[str, Layout] = {
     "observation": OBSERVATION_LAYOUT,
     "command": COMMAND_LAYOUT,
     "context": CONTEXT_LAYOUT,
-    f"history term (window of {HISTORY})": HISTORY_LAYOUT,
+    f"history frame (window of {HISTORY})": HISTORY_LAYOUT,
     "next observation (decoder's target, without noise)": NEXT_OBSERVATION_LAYOUT,
     "privileged (critic and oracle, without noise)": PRIVILEGED_LAYOUT,
 }
 
 
 def _join(layout: Layout, *parts: "Tensor") -> "Tensor":
-    """The parts side by side, (N, width); each may span several neighbouring terms."""
+    """Concatenate parts to (N, width); each may span several adjacent terms."""
     import torch
 
     joined = torch.cat(parts, dim=-1)
@@ -123,17 +134,17 @@ def observation(
     ee: "Tensor",
     d_ref: "Tensor",
 ) -> "Tensor":
-    """What the actor sees of the robot, (N, 58); `ee` is position and two columns, (N, 9), d_ref (N,)."""
+    """Assemble the actor's observation (N, 58); `ee` (N, 9) is position and two columns, d_ref is (N,)."""
     parts = (ang_vel_b, gravity_b, joint_pos_rel, joint_vel, previous_action, ee, d_ref[..., None])
     return _join(OBSERVATION_LAYOUT, *parts)
 
 
 def command(target_pos_b: "Tensor", target_rot_b: "Tensor") -> "Tensor":
-    """The task, (N, 9), of positions (N, 3) [m] and rotation matrices (N, 3, 3). Source: paper, eq. 1."""
+    """Assemble the command (N, 9) of a position (N, 3) [m] and a rotation (N, 3, 3). Source: paper, eq. 1."""
     return _join(COMMAND_LAYOUT, target_pos_b, target_rot_b[..., :, 0], target_rot_b[..., :, 1])
 
 
-def history_term(
+def history_frame(
     ang_vel_b: "Tensor",
     gravity_b: "Tensor",
     joint_pos_rel: "Tensor",
@@ -141,7 +152,7 @@ def history_term(
     joint_torque: "Tensor",
     ee: "Tensor",
 ) -> "Tensor":
-    """One step of an estimator's window, (N, 57)."""
+    """Assemble one frame (N, 57) of an estimator's window."""
     return _join(HISTORY_LAYOUT, ang_vel_b, gravity_b, joint_pos_rel, joint_vel, joint_torque, ee)
 
 
@@ -153,7 +164,7 @@ def next_observation(
     ee: "Tensor",
     feet_b: "Tensor",
 ) -> "Tensor":
-    """What a decoder predicts, (N, 49), from true values; feet_b (N, 6) [m], left then right."""
+    """Assemble the decoder's target (N, 49) from true values; feet_b (N, 6) [m] is left, then right."""
     return _join(NEXT_OBSERVATION_LAYOUT, ang_vel_b, gravity_b, joint_pos_rel, joint_vel, ee, feet_b)
 
 
@@ -171,9 +182,9 @@ def privileged(
     friction: "Tensor",
     foot_force_w: "Tensor",
 ) -> "Tensor":
-    """What only a simulation knows, (N, 80), from true values; base_height, base_mass, friction are (N,).
+    """Assemble the privileged vector (N, 80) of true values; base_height, base_mass, friction are (N,).
 
-    The end-effector's velocity is that of the world, not relative to the base, written in the base frame.
+    The end-effector's velocity is relative to the world, not to the base, and expressed in the base frame.
     """
     return _join(
         PRIVILEGED_LAYOUT,
@@ -191,33 +202,35 @@ def privileged(
 
 
 class History:
-    """The last HISTORY terms of N robots, oldest first.
+    """The last HISTORY frames of N robots, oldest first.
 
-    An episode starts with its first term repeated (choice: the paper does not say).
+    An episode starts with its first frame repeated (choice: the paper does not specify it).
     """
 
     def __init__(self, first: "Tensor") -> None:
-        """Windows of the first terms (N, 57)."""
+        """Fill the windows with the first frames (N, 57)."""
         self.window = first[:, None].repeat(1, HISTORY, 1)  # (N, HISTORY, 57)
 
-    def reset(self, ids: "Tensor", term: "Tensor") -> None:
-        """Start the robots `ids` (K,) anew from their first terms (K, 57)."""
-        self.window[ids] = term[:, None]
+    def reset(self, ids: "Tensor", frame: "Tensor") -> None:
+        """Restart the robots `ids` (K,) with their first frames (K, 57)."""
+        self.window[ids] = frame[:, None]
 
-    def push(self, term: "Tensor", fresh: "Tensor | None" = None) -> None:
-        """Forget the oldest term and append one, (N, 57); the window of before stays as it was.
+    def push(self, frame: "Tensor", fresh: "Tensor | None" = None) -> None:
+        """Drop the oldest frame and append a new one, without changing the previous window in place.
 
-        Where fresh (N,) bool, an episode starts with the term.
+        Args:
+            frame: (N, 57) Newest frames.
+            fresh: (N,) bool Robots whose episode starts with this frame.
         """
         import torch
 
-        self.window = torch.cat([self.window[:, 1:], term[:, None]], dim=1)
+        self.window = torch.cat([self.window[:, 1:], frame[:, None]], dim=1)
         if fresh is not None:
-            self.window = torch.where(fresh[:, None, None], term[:, None], self.window)
+            self.window = torch.where(fresh[:, None, None], frame[:, None], self.window)
 
 
 def rows() -> list[tuple[str, ...]]:
-    """(vector, columns, size, term, unit) of every input, for `wbc-bench list --inputs`."""
+    """List (vector, columns, size, term, unit) of all inputs, for `wbc-bench list --inputs`."""
     found = []
     for vector, layout in LAYOUTS.items():
         start = 0

@@ -12,16 +12,16 @@ class Method(NamedTuple):
 
     estimator: str
     reward: Reward
-    label: str  # as the paper's table calls it
+    label: str  # name in the paper's table
 
     @property
     def estimates(self) -> bool:
-        """Whether its context is estimated: not of the method without one, nor of the oracle."""
+        """Whether the context is estimated, which excludes the oracle and the method without a context."""
         return self.estimator not in ("none", "oracle")
 
     @property
     def signals(self) -> frozenset[Signal]:
-        """What the policy reads in an evaluation; the oracle alone reads more than the paper's policy may."""
+        """Signals that the policy reads in an evaluation; only the oracle reads privileged ones."""
         privileged: frozenset[Signal] = frozenset({"base_pose", "privileged"})
         return DEPLOYABLE | privileged if self.estimator == "oracle" else DEPLOYABLE
 

@@ -11,7 +11,7 @@ HIDDEN = (512, 256, 128)  # Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
 
 
 class Actor(nn.Module):
-    """Mean of the normalised action, of [observation, command, context]. Source: paper, eq. 1."""
+    """The mean action as a function of observation, command and context. Source: paper, eq. 1."""
 
     def __init__(self, context_dim: int) -> None:
         super().__init__()
@@ -23,5 +23,5 @@ class Actor(nn.Module):
         self.mlp = nn.Sequential(*layers, nn.Linear(HIDDEN[-1], ACTIONS))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Action means (N, 14) of inputs (N, 67 + context_dim)."""
+        """Compute mean actions (N, 14) of inputs (N, 67 + context_dim)."""
         return self.mlp(self.normalizer(x))

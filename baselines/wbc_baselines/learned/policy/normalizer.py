@@ -1,9 +1,9 @@
-"""Running mean and standard deviation of an input, updated by whoever trains and by nobody else."""
+"""Running mean and standard deviation of an input, updated during training only."""
 
 import torch
 from torch import Tensor, nn
 
-FLOOR = 1e-2  # added to the deviation, so that a constant column is not blown up. Source: rsl-rl-lib 5.5
+FLOOR = 1e-2  # added to the deviation, so that a constant column is not amplified. Source: rsl-rl-lib 5.5
 
 
 class Normalizer(nn.Module):
@@ -21,12 +21,12 @@ class Normalizer(nn.Module):
         self.register_buffer("count", torch.zeros((), dtype=torch.float64), persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalised copy of (..., size)."""
+        """Return a normalized copy of (..., size)."""
         return (x - self.mean) / (self.std + FLOOR)
 
     @torch.no_grad()
     def update(self, x: Tensor) -> None:
-        """Take samples (..., size) into account. Source: Chan, Golub, LeVeque 1979."""
+        """Update the statistics with samples (..., size). Source: Chan, Golub, LeVeque 1979."""
         x = x.reshape(-1, self.mean.shape[0])
         count = self.count + len(x)
         weight = (len(x) / count).to(self.mean.dtype)  # of the new samples

@@ -1,4 +1,4 @@
-"""A policy of an ONNX file, computed by onnxruntime on one thread."""
+"""Policies of ONNX files, computed by onnxruntime on one thread."""
 
 import hashlib
 from pathlib import Path
@@ -21,7 +21,14 @@ class OnnxEngine:
     """A policy computed by onnxruntime, on one thread."""
 
     def __init__(self, path: Path) -> None:
-        """Raises: CheckpointError, the file is missing, damaged or not one of ours."""
+        """Open an exported policy.
+
+        Args:
+            path: ONNX file.
+
+        Raises:
+            CheckpointError: The file is missing, damaged, or was not exported by this package.
+        """
         if not path.is_file():
             raise CheckpointError(f"there is no file '{path}' (onnx:FILE)")
         data = path.read_bytes()
@@ -47,7 +54,7 @@ class OnnxEngine:
             )
 
     def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        """One control step of N robots."""
+        """Compute one control step of N robots."""
         arrays = {name: np.ascontiguousarray(values[name].numpy()) for name in self.flow.inputs}
         found = self._session.run([_output(name) for name in self.flow.outputs], arrays)
         return {n: torch.from_numpy(np.asarray(v)) for n, v in zip(self.flow.outputs, found, strict=True)}

@@ -1,4 +1,4 @@
-"""A trained method as one function: observation, window and state in, action and next of both out."""
+"""A trained method as one function of observation, window and recurrent state."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from wbc_baselines.learned.policy.estimators import Estimator
 from wbc_baselines.learned.policy.inputs import (
     COMMAND,
     HISTORY,
-    HISTORY_TERM,
+    HISTORY_FRAME,
     OBSERVATION,
     PRIVILEGED,
     VELOCITY,
@@ -18,14 +18,17 @@ from wbc_baselines.learned.policy.networks import Actor
 
 
 class Flow(NamedTuple):
-    """Names and widths of what goes into a policy and comes out of it; the batch is the first axis."""
+    """Names and shapes of the inputs and outputs of a policy, without the batch axis in front.
+
+    The names are those of exported ONNX files; `term` is the newest frame of the window.
+    """
 
     inputs: dict[str, tuple[int, ...]]
     outputs: tuple[str, ...]  # `window` and `state` are the next step's inputs
 
 
 class Policy(nn.Module):
-    """Actor and estimator, deterministic: latent mean, action mean."""
+    """Actor and estimator, deterministic: with the means of latent and action."""
 
     def __init__(self, actor: Actor, estimator: Estimator) -> None:
         super().__init__()
@@ -33,7 +36,7 @@ class Policy(nn.Module):
         self.flow = flow_of(estimator)
 
     def forward(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        """One control step of N robots; names and widths are those of `flow`, and maybe the `latent`."""
+        """Compute one control step of N robots; returns those of `flow`, and any `latent`."""
         parts, found = [values["observation"], values["command"]], {}
         if "privileged" in values:
             parts.append(values["privileged"])
@@ -49,11 +52,11 @@ class Policy(nn.Module):
 
 
 def flow_of(estimator: Estimator) -> Flow:
-    """What a policy with this estimator reads and writes."""
+    """Return the inputs and outputs of a policy with this estimator."""
     inputs: dict[str, tuple[int, ...]] = {"observation": (OBSERVATION,), "command": (COMMAND,)}
     outputs = ["action"]
     if estimator.trainable:
-        inputs |= {"term": (HISTORY_TERM,), "window": (HISTORY, HISTORY_TERM)}
+        inputs |= {"term": (HISTORY_FRAME,), "window": (HISTORY, HISTORY_FRAME)}
         outputs.append("window")
         if estimator.state_dim:
             inputs["state"] = (estimator.state_dim,)

@@ -1,4 +1,4 @@
-"""The task-progress reference: a distance that only time shortens, and the phase it sets."""
+"""The task-progress reference, a distance that decays with time alone, and the phase derived from it."""
 
 import torch
 from torch import Tensor
@@ -8,22 +8,28 @@ GATE_CENTRE = 1.0  # mu, in the unit of d_ref. Source: as above
 
 
 def initial_reference(pos_err: Tensor, rot_err: Tensor) -> Tensor:
-    """d_ref (N,) at the start, of errors [m] and [rad]. Source: paper, eq. rfm_phase, first line."""
+    """Compute the initial d_ref (N,) of errors [m] and [rad]. Source: paper, eq. rfm_phase, first line."""
     return 2 * pos_err + rot_err
 
 
 def advance(d_ref: Tensor, decay: Tensor | float, period: float) -> Tensor:
-    """d_ref (N,) one control period [s] later; decay [1/s]. Source: paper, eq. rfm_phase, second line."""
+    """Advance d_ref (N,) by one control period [s]; decay [1/s].
+
+    Source: paper, eq. rfm_phase, second line.
+    """
     return (d_ref - decay * period).clamp(min=0.0)
 
 
 def gate(d_ref: Tensor, k: float = GATE_SLOPE, mu: float = GATE_CENTRE) -> Tensor:
-    """Phase g (N,): near 1 while approaching, near 0 at the target. Source: paper, eq. rfm_phase."""
+    """Compute the phase g (N,), near 1 while approaching and near 0 at the target.
+
+    Source: paper, eq. rfm_phase.
+    """
     return torch.sigmoid(k * (d_ref - mu))
 
 
 def rotation_from_rho6(rho6: Tensor) -> Tensor:
-    """Rotation matrices (N, 3, 3) nearest in Gram-Schmidt's sense to noisy columns (N, 6).
+    """Orthonormalize two noisy columns (N, 6) to rotation matrices (N, 3, 3) by Gram-Schmidt.
 
     Source: Zhou et al. 2019, "On the Continuity of Rotation Representations", eq. 15.
     """
@@ -34,13 +40,13 @@ def rotation_from_rho6(rho6: Tensor) -> Tensor:
 
 
 def twice_sine(rot: Tensor) -> Tensor:
-    """Axes (N, 3) of rotations (N, 3, 3), twice as long as the sine of the angle."""
+    """Compute the axes (N, 3) of rotations (N, 3, 3), with a length of twice the sine of the angle."""
     skew = rot - rot.transpose(1, 2)
     return torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
 
 
 def pose_errors(pos: Tensor, rot: Tensor, target_pos: Tensor, target_rot: Tensor) -> tuple[Tensor, Tensor]:
-    """Position error (N,) [m] and geodesic angle (N,) [rad] of poses in one frame.
+    """Compute position errors (N,) [m] and geodesic angles (N,) [rad] between poses in one frame.
 
     Source: paper, section III-D; ||a - b||_F = 2 sqrt(2) sin(angle / 2).
     """

@@ -1,8 +1,10 @@
-"""What the arm alone would do to bring the hand to its target: inverse kinematics and gravity, batched.
+"""Batched inverse kinematics and gravity compensation of the arm alone.
 
-A policy that must find out by reinforcement how an arm reaches takes tens of millions of control steps for
-what geometry says at once. Source: Nakamura, Hanafusa 1986, "Inverse kinematic solutions with singularity
-robustness for robot manipulator control", for the damping.
+By reinforcement learning a policy needs tens of millions of control steps to discover how the arm reaches a
+target, which inverse kinematics computes directly.
+
+Source: Nakamura, Hanafusa 1986, "Inverse kinematic solutions with singularity robustness for robot
+manipulator control", for the damping.
 """
 
 import mujoco
@@ -13,15 +15,15 @@ from torch import Tensor
 from wbc_baselines.learned.policy.reference import rotation_from_rho6, twice_sine
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
-ROTATION_WEIGHT = 0.3  # [m/rad] of orientation against position; choice
+ROTATION_WEIGHT = 0.3  # [m/rad] weight of the orientation relative to the position; choice
 DAMPING = 0.05  # [m/rad]; choice
-STEPS, LONGEST = 8, 0.3  # Gauss-Newton steps, and of each the most that a joint turns [rad]; choice
-MARGIN = 0.05  # [rad] inside the joints' limits; choice
+STEPS, LONGEST = 8, 0.3  # Gauss-Newton steps, and the largest joint rotation per step [rad]; choice
+MARGIN = 0.05  # [rad] distance kept from the joint limits; choice
 GRAVITY = 9.81  # [m/s^2]
 
 
 class ArmKinematics:
-    """The arm as screws and masses in the base frame."""
+    """The arm as joint axes and masses in the base frame, at joint angles of zero."""
 
     def __init__(self, robot: Robot, device: torch.device | str = "cpu") -> None:
         model = robot.model()
@@ -43,9 +45,14 @@ class ArmKinematics:
         self._upper = tensor(robot.upper[NUM_LEG_JOINTS:]) - MARGIN
 
     def hand(self, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Position (N, 3) [m], rotation (N, 3, 3) and Jacobian (N, 6, 6) of the hand, base frame.
+        """Compute pose and Jacobian of the hand in the base frame.
 
-        q: (N, 6) [rad] arm joints. Rows of the Jacobian are linear, then angular velocity.
+        Args:
+            q: (N, 6) [rad] Arm joints.
+
+        Returns:
+            Position (N, 3) [m], rotation (N, 3, 3) and Jacobian (N, 6, 6), whose rows are the linear, then
+            the angular velocity.
         """
         axis, anchor, rot, shift = self._chain(q)
         pos = rot[-1] @ self._pos + shift[-1]
@@ -53,7 +60,15 @@ class ArmKinematics:
         return pos, rot[-1] @ self._rot, torch.cat([linear, axis], -1).transpose(1, 2)
 
     def holding_torque(self, q: Tensor, gravity_b: Tensor) -> Tensor:
-        """Torques (N, 6) [N m] that hold the arm at rest; gravity_b (N, 3) points down, base frame."""
+        """Compute the torques that hold the arm at rest.
+
+        Args:
+            q: (N, 6) [rad] Arm joints.
+            gravity_b: (N, 3) Unit vector that points down, base frame.
+
+        Returns:
+            Torques (N, 6) [N m].
+        """
         axis, anchor, rot, shift = self._chain(q)
         torque = torch.zeros_like(q)
         for k, (mass, com) in enumerate(zip(self._mass, self._com, strict=True)):
@@ -78,7 +93,15 @@ class ArmKinematics:
         return torch.stack(axes, 1), torch.stack(anchors, 1), rots, shifts
 
     def solve(self, q: Tensor, command: Tensor) -> Tensor:
-        """Arm joints (N, 6) [rad] that bring the hand nearest to commands (N, 9), sought from joints q."""
+        """Solve for arm joints that bring the hand as near as possible to its target.
+
+        Args:
+            q: (N, 6) [rad] Arm joints from which the search starts.
+            command: (N, 9) Target position [m] and two columns of the target rotation, base frame.
+
+        Returns:
+            Arm joints (N, 6) [rad] within the joint limits.
+        """
         wanted = rotation_from_rho6(command[:, 3:])
         weight = torch.tensor([1.0] * 3 + [ROTATION_WEIGHT] * 3, device=q.device)
         damping = DAMPING**2 * torch.eye(q.shape[1], device=q.device)
@@ -109,13 +132,20 @@ def _lumps(model: mujoco.MjModel, data: mujoco.MjData, first: int) -> tuple[np.n
 
 
 def cross_matrix(axis: Tensor) -> Tensor:
-    """The matrix (3, 3) whose product with a vector is the cross product of `axis` (3,) with it."""
+    """Return the matrix (3, 3) whose product with a vector is the cross product of `axis` (3,) with it."""
     x, y, z = axis.tolist()
     return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], device=axis.device)
 
 
 def rotation_about(cross: Tensor, angle: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) by angles (N,) [rad] about the unit axis of a `cross_matrix` (3, 3).
+    """Compute rotations about a fixed axis.
+
+    Args:
+        cross: (3, 3) `cross_matrix` of the unit axis.
+        angle: (N,) [rad] Angles.
+
+    Returns:
+        Rotation matrices (N, 3, 3).
 
     Source: Rodrigues' formula.
     """
@@ -124,7 +154,7 @@ def rotation_about(cross: Tensor, angle: Tensor) -> Tensor:
 
 
 def rotation_vector(rot: Tensor) -> Tensor:
-    """Rotation vectors (N, 3) [rad] of rotations (N, 3, 3); near a half turn their direction is vague."""
+    """Convert rotations (N, 3, 3) to rotation vectors (N, 3) [rad]; near a half turn the axis is inexact."""
     axis = twice_sine(rot)
     length = torch.linalg.vector_norm(axis, dim=-1)
     cosine = (rot.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2

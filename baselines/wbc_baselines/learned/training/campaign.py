@@ -1,4 +1,4 @@
-"""All methods and seeds at one equal budget, in any order, on any number of machines that share a folder."""
+"""Training of several methods and seeds at an equal budget, on any number of machines that share a folder."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -6,33 +6,57 @@ from pathlib import Path
 from typing import NamedTuple
 
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.training.config import Settings
+from wbc_baselines.learned.training.config import TrainConfig
 from wbc_baselines.learned.training.run_folder import RunFolder, run
 
 Progress = Callable[[int, int, str], None]
 
 
 class Standing(NamedTuple):
-    """Where one run stands."""
+    """The progress of one run."""
 
     name: str
     state: str  # done, running, interrupted, not started
-    samples: int
-    seconds: float
+    samples: int  # control steps
+    seconds: float  # of training
     success: float | None  # of the episodes that ended in the last iteration
     falls: float | None
 
 
-def runs_of(base: Settings, methods: Sequence[str], seeds: int) -> list[Settings]:
-    """Every method with every seed; seeds outermost, so that a campaign cut short compares all methods."""
+def runs_of(base: TrainConfig, methods: Sequence[str], seeds: int) -> list[TrainConfig]:
+    """List the configurations of all methods and seeds, ordered by seed.
+
+    A campaign that is cut short has then trained all methods with the same seeds.
+
+    Args:
+        base: Settings that all runs share.
+        methods: Methods to train.
+        seeds: Number of seeds per method.
+
+    Returns:
+        One configuration per run.
+
+    Raises:
+        UnknownNameError: There is no such method.
+        TrainingError: A setting is out of its range.
+    """
     for method in methods:
         replace(base, method=method).check()
     return [replace(base, method=method, seed=seed) for seed in range(seeds) for method in methods]
 
 
-def campaign(settings: Sequence[Settings], out: Path, progress: Progress) -> Iterator[Settings]:
-    """Train whatever of `settings` is not done and nobody else trains; yields each run finished here."""
-    for one in settings:
+def campaign(configs: Sequence[TrainConfig], out: Path, progress: Progress) -> Iterator[TrainConfig]:
+    """Train all runs that are neither finished nor claimed by another process.
+
+    Args:
+        configs: Configurations of the runs.
+        out: Folder of all runs.
+        progress: Is called with completed and total control steps and a line of text.
+
+    Yields:
+        The configuration of each run that was finished here.
+    """
+    for one in configs:
         folder = RunFolder(out / one.name)
         if is_done(folder, one) or not folder.take():
             continue
@@ -41,17 +65,17 @@ def campaign(settings: Sequence[Settings], out: Path, progress: Progress) -> Ite
         yield one
 
 
-def is_done(folder: RunFolder, settings: Settings) -> bool:
-    """Whether the run has been finished at this budget or more."""
+def is_done(folder: RunFolder, config: TrainConfig) -> bool:
+    """Return whether the run has been finished with this budget or a larger one."""
     import json
 
-    return folder.finished.exists() and json.loads(folder.finished.read_text())["samples"] >= settings.budget
+    return folder.finished.exists() and json.loads(folder.finished.read_text())["samples"] >= config.budget
 
 
 def standing(out: Path) -> list[Standing]:
-    """Where every run below a folder stands."""
+    """List the progress of all runs below a folder, ordered by method."""
     found = []
-    for path in sorted(out.glob("*@*/settings.json")):
+    for path in sorted(out.glob("*@*/config.json")):
         folder = RunFolder(path.parent)
         rows = folder.read_metrics()
         last = rows[-1] if rows else {}

@@ -1,4 +1,4 @@
-"""The command line of training: `wbc-train COMMAND --help`."""
+"""The command line of training, `wbc-train COMMAND --help`."""
 
 import sys
 from dataclasses import dataclass
@@ -8,45 +8,50 @@ from typing import Annotated
 import tyro
 from tyro.conf import OmitArgPrefixes, subcommand
 
-from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_bench.cli.common import run_command
 
 RUNS = Path("runs")
-DEFAULTS = Settings("transformer_gru")  # of what trains methods given otherwise
+DEFAULTS = TrainConfig("transformer_gru")  # for commands that take their methods from --methods
 
 
 @dataclass(frozen=True)
 class Run:
-    """Train one method with one seed; the same command resumes."""
+    """Train one method with one seed. The same command resumes an interrupted run."""
 
-    settings: OmitArgPrefixes[Settings]
+    config: OmitArgPrefixes[TrainConfig]
     out: Path = RUNS
-    """Folder of runs; this one goes into OUT/METHOD@SEED."""
+    """Folder of all runs; this run is written to OUT/METHOD@SEED."""
     change: bool = False
-    """Go on with these settings where the run was started with others (another --envs, --backend, schedule),
-    in new episodes; what changes is noted in the run's changes.jsonl."""
+    """Whether to continue a run with settings other than those it was started with, for example another
+    --num-envs, --backend or schedule. New episodes are begun, and the changes are recorded in the run's
+    changes.jsonl."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.run_folder import RunFolder, run
         from wbc_bench.progress import Progress
 
-        folder = RunFolder(self.out / self.settings.name)
+        folder = RunFolder(self.out / self.config.name)
         with Progress("steps") as progress:
-            run(self.settings, folder, progress.update, change=self.change)
+            run(self.config, folder, progress.update, change=self.change)
         print(folder.path)
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """Train all methods x seeds at an equal budget; run it on several machines that share OUT, or again."""
+    """Train several methods with several seeds each at an equal budget.
 
-    settings: OmitArgPrefixes[Settings] = DEFAULTS
+    Runs that are finished, or in progress elsewhere, are skipped, so the command can be repeated, and started
+    on several machines that share the folder OUT.
+    """
+
+    config: OmitArgPrefixes[TrainConfig] = DEFAULTS
     methods: tuple[str, ...] = ()
-    """Methods instead of --method; all when not given."""
+    """Methods to train, which replace --method; all methods of the study if not given."""
     seeds: int = 3
-    """Seeds 0 .. SEEDS - 1 instead of --seed."""
+    """Number of seeds per method, 0 to SEEDS - 1, which replace --seed."""
     out: Path = RUNS
-    """Folder of runs."""
+    """Folder of all runs."""
 
     def run(self) -> None:
         from wbc_baselines.learned.policy.methods import METHODS
@@ -55,7 +60,7 @@ class Campaign:
 
         if self.seeds < 1:
             raise TrainingError(f"--seeds {self.seeds}: valid: 1 or more")
-        chosen = runs_of(self.settings, self.methods or tuple(METHODS), self.seeds)
+        chosen = runs_of(self.config, self.methods or tuple(METHODS), self.seeds)
         with Progress("steps") as progress:
             for done in campaign(chosen, self.out, progress.update):
                 print(self.out / done.name, flush=True)
@@ -63,10 +68,10 @@ class Campaign:
 
 @dataclass(frozen=True)
 class Status:
-    """Say what is done."""
+    """List all runs with their progress."""
 
     out: Path = RUNS
-    """Folder of runs."""
+    """Folder of all runs."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.campaign import standing
@@ -98,12 +103,12 @@ class Status:
 
 @dataclass(frozen=True)
 class Curves:
-    """Draw the learning curves of all runs, PNG and SVG."""
+    """Plot the learning curves of all runs as PNG and SVG."""
 
     out: Path = RUNS
-    """Folder of runs."""
+    """Folder of all runs."""
     figures: Path = Path("results/figures")
-    """Where the figures go."""
+    """Folder to which the figures are written."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.curves import write_curves
@@ -117,10 +122,10 @@ class Curves:
 
 @dataclass(frozen=True)
 class Gates:
-    """Print the mean gates of trained runs: the constants that the additive reward puts in their place."""
+    """Print the mean gates of trained runs, from which the constants of the additive reward are taken."""
 
     out: Path = RUNS
-    """Folder of runs."""
+    """Folder of all runs."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.curves import measured_scores
@@ -134,21 +139,21 @@ class Gates:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure how fast methods train and run, over the physics alone; on an idle machine, please."""
+    """Measure training and evaluation speed relative to the physics alone, on an otherwise idle machine."""
 
-    settings: OmitArgPrefixes[Settings] = DEFAULTS
+    config: OmitArgPrefixes[TrainConfig] = DEFAULTS
     methods: tuple[str, ...] = ("no_latent", "transformer_gru")
-    """Methods instead of --method."""
+    """Methods to measure, which replace --method."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.campaign import runs_of
         from wbc_baselines.learned.training.throughput import measure
         from wbc_bench.results.table import Table
 
-        if self.settings.backend != "cpu":
-            raise TrainingError(f"--backend {self.settings.backend}: valid: cpu, whose engine is timed")
-        runs_of(self.settings, self.methods, 1)  # refuses what cannot be run
-        found = measure(self.settings, self.methods)
+        if self.config.backend != "cpu":
+            raise TrainingError(f"--backend {self.config.backend}: valid: cpu, whose engine is timed")
+        runs_of(self.config, self.methods, 1)  # refuses what cannot be run
+        found = measure(self.config, self.methods)
         cells = [
             (
                 s.method,
@@ -166,27 +171,29 @@ class Bench:
 
 
 @dataclass(frozen=True)
-class Imitate:
-    """Make a start for `run --start`: a policy without context that imitates another controller."""
+class Dagger:
+    """Imitate another controller by a policy without a context, for `run --init-checkpoint`."""
 
     path: Path
-    """Where to: PATH.safetensors, a checkpoint that `wbc-bench eval --controller learned:PATH` can judge."""
+    """File to write, PATH.safetensors; `wbc-bench eval --controller learned:PATH` evaluates it."""
     teacher: str = "ik:standing"
-    """SPEC of the controller to imitate."""
+    """SPEC of the controller that is imitated."""
     protocol: str = "ablation_v1"
-    """Whose targets, randomisation, noise and pushes."""
+    """Protocol whose targets, randomization, noise and pushes are used."""
     episodes: int = 150
-    """Episodes a round."""
+    """Number of episodes per round."""
     rounds: int = 17
-    """Rounds; the student drives in none of the first's episodes, and in ever more of the later ones'."""
-    calm: int = 13
-    """First rounds, without disturbances; then they rise to the protocol's in the last."""
+    """Number of rounds. The student acts in none of the first round's episodes and in a growing fraction of
+    the later ones."""
+    undisturbed_rounds: int = 13
+    """Number of first rounds without noise, pushes and randomization; afterwards these grow linearly to the
+    protocol's in the last round; 0 for a ramp from the first round on."""
     updates: int = 3000
-    """Updates of the student after each round."""
+    """Number of updates of the student after each round."""
     seed: int = 0
-    """Seed of draws and weights."""
+    """Seed of all random samples and of the initial weights."""
     workers: int = 2
-    """Processes; the result does not depend on it."""
+    """Number of processes; the result does not depend on it."""
 
     def run(self) -> None:
         import time
@@ -194,29 +201,32 @@ class Imitate:
         from wbc_baselines.learned.policy import checkpoint
         from wbc_baselines.learned.policy.card import new_card
         from wbc_baselines.learned.policy.estimators import make_estimator
-        from wbc_baselines.learned.training.dagger import METHOD, imitate
-        from wbc_baselines.learned.training.target_set import read_pool
+        from wbc_baselines.learned.training.dagger import METHOD, dagger
+        from wbc_baselines.learned.training.target_set import read_target_set
         from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.progress import Progress
 
         for name in ("episodes", "rounds", "updates", "workers"):
             if getattr(self, name) < 1:
                 raise TrainingError(f"--{name} {getattr(self, name)}: valid: 1 or more")
-        if not 0 <= self.calm < self.rounds:
-            raise TrainingError(f"--calm {self.calm}: valid: 0 to {self.rounds - 1}, less than --rounds")
+        if not 0 <= self.undisturbed_rounds < self.rounds:
+            raise TrainingError(
+                f"--undisturbed-rounds {self.undisturbed_rounds}: valid: 0 to {self.rounds - 1}, "
+                "less than --rounds"
+            )
         if self.path.suffix != ".safetensors":
             raise TrainingError(f"--path '{self.path}': valid: a name that ends in .safetensors")
         protocol, _ = find_protocol(self.protocol)
         begun = time.monotonic()
         with Progress("episodes") as progress:
-            actor, error = imitate(
+            actor, error = dagger(
                 self.teacher,
                 protocol,
-                read_pool(protocol),
+                read_target_set(protocol),
                 self.episodes,
                 self.rounds,
                 self.seed,
-                self.calm,
+                self.undisturbed_rounds,
                 self.updates,
                 self.workers,
                 progress.update,
@@ -228,29 +238,29 @@ class Imitate:
 
 @dataclass(frozen=True)
 class Targets:
-    """Draw the pool of feasible targets that training picks from (12,000: five minutes on two cores)."""
+    """Generate the feasible targets that training picks from (12,000 take five minutes on two cores)."""
 
     protocol: str = "ablation_v1"
-    """Whose targets."""
+    """Protocol whose targets are generated."""
     count: int = 12_000
-    """How many; the strata in turn."""
+    """Number of targets; the strata alternate."""
     workers: int = 2
-    """Processes; the pool does not depend on it."""
+    """Number of processes; the targets do not depend on it."""
     path: Path | None = None
-    """Where to; the package's own folder when not given."""
+    """File to write; a file in the package's own folder if not given."""
 
     def run(self) -> None:
-        from wbc_baselines.learned.training.target_set import POOLS, draw_pool, write_pool
+        from wbc_baselines.learned.training.target_set import TARGET_SETS, draw_target_set, write_target_set
         from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.progress import Progress
 
         if self.count < 3:
-            raise TrainingError(f"--count {self.count}: valid: 3 or more, one a stratum")
+            raise TrainingError(f"--count {self.count}: valid: 3 or more, one per stratum")
         protocol, _ = find_protocol(self.protocol)
-        path = self.path or POOLS / f"{protocol.name}.parquet"
+        path = self.path or TARGET_SETS / f"{protocol.name}.parquet"
         with Progress("targets") as progress:
-            pool = draw_pool(protocol, self.count, self.workers, progress.update)
-        write_pool(pool, protocol, path)
+            target_set = draw_target_set(protocol, self.count, self.workers, progress.update)
+        write_target_set(target_set, protocol, path)
         print(path)
 
 
@@ -261,7 +271,7 @@ Command = (
     | Annotated[Curves, subcommand("curves")]
     | Annotated[Gates, subcommand("gates")]
     | Annotated[Bench, subcommand("bench")]
-    | Annotated[Imitate, subcommand("imitate")]
+    | Annotated[Dagger, subcommand("dagger")]
     | Annotated[Targets, subcommand("targets")]
 )
 

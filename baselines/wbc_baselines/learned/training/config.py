@@ -1,4 +1,4 @@
-"""The settings of a training run."""
+"""The configuration of a training run, its schedules and its checks."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -7,7 +7,7 @@ from typing import Literal
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
 
-FREE = frozenset({"budget", "threads"})  # settings that may differ when a run goes on
+FREE = frozenset({"budget", "threads"})  # settings that may differ when a run is resumed
 
 
 class TrainingError(BenchError):
@@ -15,195 +15,231 @@ class TrainingError(BenchError):
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Everything that what a run learns depends on; a run resumes with the same ones only."""
+class TrainConfig:
+    """All settings that affect what a run learns. A run can be resumed only with identical settings.
+
+    Control steps are counted over all environments. Schedules are intervals in control steps, not parts of
+    the budget, so a short run is the beginning of every longer one. Names that rsl-rl also has mean the same
+    here.
+    """
 
     method: str
-    """A method of the study: no_latent, cenet, gru, transformer, transformer_gru, oracle, ..."""
+    """Method of the study, for example no_latent, cenet, gru, transformer, transformer_gru or oracle."""
     seed: int = 0
-    """Seed of weights and draws."""
+    """Seed of the initial weights and of all random samples of the run."""
     budget: float = 60e6
-    """Control steps to train on, over all environments."""
+    """Length of the training [control steps], summed over all environments."""
     protocol: str = "ablation_v1"
-    """Whose targets, randomisation, noise, pushes and terminations are trained on."""
-    envs: int = 768
-    """Environments side by side."""
-    steps: int = 24
-    """Control steps of a rollout."""
-    epochs: int = 3
-    """Passes of PPO over a rollout."""
-    minibatches: int = 4
-    """Parts of a rollout in one pass."""
+    """Protocol whose targets, randomization, noise, pushes and terminations are used in training."""
+    num_envs: int = 768
+    """Number of environments simulated in parallel."""
+    num_steps_per_env: int = 24
+    """Length of a rollout [control steps per environment]."""
+    num_learning_epochs: int = 3
+    """Number of passes of PPO over each rollout."""
+    num_mini_batches: int = 4
+    """Number of mini-batches into which PPO divides a rollout in each pass."""
     learning_rate: float = 1e-4
-    """Of the policy at the start; then adapted to `desired_kl`."""
-    least_learning_rate: float = 2e-5
-    """Below which it is not adapted."""
+    """Initial learning rate of the policy [1]; it is then adapted to reach `desired_kl`."""
+    min_learning_rate: float = 2e-5
+    """Lower bound [1] of the adapted learning rate of the policy."""
     critic_learning_rate: float = 5e-4
-    """Of the critic, throughout."""
+    """Constant learning rate of the critic [1]."""
     desired_kl: float = 0.03
-    """KL divergence of an update that the learning rate aims at."""
+    """KL divergence per update [nat] that the adapted learning rate aims at."""
     gamma: float = 0.99
-    """Discount of a control step."""
+    """Discount factor per control step [1]."""
     lam: float = 0.95
-    """Lambda of the critic's targets."""
-    policy_lam: float = 0.8
-    """Lambda of the policy's advantages. The better the critic, the less is gained by looking further."""
-    clip: float = 0.2
-    """PPO's clip."""
-    gradient_norm: float = 1.0
-    """Largest norm of a gradient."""
-    start: str = "oracle@0"
-    """Checkpoint that the policy begins with: one without context (`wbc-train imitate`), the oracle, or one
-    with the same estimator, which begins with it as well; "" for random weights."""
-    start_samples: int = 30_000_000
-    """Observations that the start's normaliser counts for. With fewer, first falls shift it faster than the
-    policy can follow: at 200,000 a start that stood for 2.9 s fell at 1.2 s half a million steps later,
-    before any update of the policy."""
+    """Lambda of the critic's return targets [1], as in TD(lambda)."""
+    actor_lam: float = 0.8
+    """Lambda of the policy's generalized advantage estimates [1]. It is smaller than the critic's because a
+    well-trained critic makes long sums of rewards unnecessary."""
+    clip_param: float = 0.2
+    """Clipping range of PPO's probability ratio [1]."""
+    max_grad_norm: float = 1.0
+    """Largest norm to which a gradient is clipped [1]."""
+    init_checkpoint: str = "oracle@0"
+    """Checkpoint whose weights initialize the policy: one without a context (see `wbc-train dagger`), the
+    oracle, or one with the same estimator, which is then initialized as well; "" for random weights."""
+    init_normalizer_count: int = 30_000_000
+    """Number of observations that the initial checkpoint's normalizer statistics count for. With few, the
+    first falls shift the statistics faster than the policy can adapt: with 200,000, a policy that stood for
+    2.9 s fell at 1.2 s half a million control steps later, before its first update."""
     teacher: str = "oracle@0"
-    """Checkpoint without memory (no_latent or oracle) that the policy imitates at first; "" for none."""
-    teacher_steps: float = 8e6
-    """Control steps of that: the policy learns from the teacher's answers alone, the critic from returns. In
-    the first half the teacher drives in a part of the environments, at first in all."""
-    advice_steps: float = 30e6
-    """Control steps until which it then advises beside PPO, less and less; 0 for never."""
-    arm_teaching: tuple[float, float] = (8e6, 57e6)
-    """Control steps from which on and until when its inverse kinematics teaches the arm, beside PPO."""
-    posture_teaching: tuple[float, float] = (8e6, 57e6)
-    """Control steps from which on and until when robots that stand still, short of a target in reach, are
-    taught a posture of the legs that reaches it, beside PPO; 0 0 for never, as above."""
-    mirror: bool = False
-    """Whether PPO also learns from the mirror image of every sample; for methods without an estimator, whose
-    inputs have one."""
-    critic_iterations: int = 15
-    """First iterations in which only the critic learns: it knows nothing of a start's returns."""
+    """Checkpoint without an estimated context (no_latent or oracle) from which the policy is distilled at
+    first; "" for no distillation."""
+    distillation_steps: float = 8e6
+    """Duration of the distillation [control steps]. Meanwhile the policy is fitted to the teacher's actions
+    alone and the critic to the returns. In the first half the teacher acts in a part of the environments,
+    which shrinks from all to none."""
+    kickstart_steps: float = 30e6
+    """End [control steps] of the phase in which the teacher's actions are an auxiliary loss beside PPO, with
+    a weight that falls linearly to 0 from the end of the distillation; 0 for none."""
+    arm_ik_loss: tuple[float, float] = (8e6, 57e6)
+    """Interval [control steps] during which an imitation loss toward the arm's inverse kinematics is added to
+    PPO; 0 0 for never."""
+    posture_loss: tuple[float, float] = (8e6, 57e6)
+    """Interval [control steps] during which robots that stand still with the hand short of a target, although
+    it needs no step, imitate a leg posture that reaches it, in addition to PPO; 0 0 for never."""
+    symmetry_augmentation: bool = False
+    """Whether PPO also learns from the mirror image of every sample; only for methods without an estimator,
+    because the inputs of an estimator are not mirrored."""
+    critic_warmup_iterations: int = 15
+    """Number of first iterations in which only the critic is updated, because it knows nothing yet about the
+    returns of the initial policy; 0 for none."""
     std_legs: tuple[float, float] = (0.27, 0.05)
-    """Standard deviation of the leg actions at the start and in the end. Who learns at 0.14 stands still and
-    falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
+    """Initial and final standard deviation of the leg actions [1], in units of the action scale. At 0.14 a
+    policy keeps standing still and falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
     std_arm: tuple[float, float] = (0.4, 0.05)
-    """Standard deviation of the arm actions at the start and in the end."""
+    """Initial and final standard deviation of the arm actions [1], in units of the action scale."""
     std_steps: tuple[float, float] = (36e6, 58e6)
-    """Control steps from which on and until when they fall, exponentially: the last two fifths of the
-    budget. What succeeds at all, succeeds while they fall."""
+    """Interval [control steps] over which both standard deviations decay exponentially from their initial to
+    their final value. Most of the successful episodes appear during this decay."""
     timestep: float = 0.01
-    """[s] of the physics; an evaluation always takes the protocol's."""
+    """Physics step [s] in training; an evaluation always uses the protocol's."""
     decimation: int = 2
-    """Physics steps in a control period."""
+    """Number of physics steps per control period."""
     curriculum: float = 0.0
-    """Control steps over which the strata ramp from mostly `arm` to the protocol's weights."""
-    calm: tuple[float, float] = (0.0, 0.0)
-    """Control steps from which on and until when noise, pushes and randomisation rise from none to the
-    protocol's; 0 0 for all from the first step on: who learns to stand undisturbed does not learn to step."""
+    """Duration [control steps] of the curriculum from mostly `arm` targets to the protocol's weights of the
+    strata; 0 for the protocol's weights from the beginning."""
+    disturbance_ramp: tuple[float, float] = (0.0, 0.0)
+    """Interval [control steps] over which noise, pushes and randomization grow linearly from none to the
+    protocol's; 0 0 for the protocol's from the beginning, because a policy that first learns to stand
+    undisturbed does not learn to step."""
     push_interval: tuple[float, float] = (1.5, 3.0)
-    """[s] between two pushes, least and most; 0 0 for the protocol's. Most steps of an episode show a robot
-    that stands: with more pushes more of them show how to stay up."""
+    """Shortest and longest time between two pushes [s]; 0 0 for the protocol's. Frequent pushes make up for
+    the many control steps in which a robot merely stands."""
     estimator_share: float = 0.125
-    """Part of the environments whose rollouts train the estimator; drawn anew each iteration."""
-    estimator_minibatches: int = 4
-    """Updates of the estimator in an iteration, each on whole rollouts of its own environments."""
+    """Fraction of the environments [1] whose rollouts train the estimator; they are drawn anew in each
+    iteration."""
+    estimator_mini_batches: int = 4
+    """Number of updates of the estimator per iteration, each on whole rollouts of a part of its
+    environments."""
     estimator_learning_rate: float = 1e-3
-    """Of the estimator's Adam."""
+    """Constant learning rate of the estimator [1]."""
     backend: Literal["cpu", "warp"] = "cpu"
-    """mujoco.batch on a CPU, or mujoco_warp on a GPU."""
+    """Physics engine of the training: mujoco.batch on a CPU, or mujoco_warp on a GPU."""
     threads: int = 2
-    """Threads of physics and of torch on a CPU."""
+    """Number of CPU threads for the physics and for torch."""
 
     @property
     def name(self) -> str:
-        """METHOD@SEED."""
+        """Name of the run, METHOD@SEED."""
         return f"{self.method}@{self.seed}"
 
     def changes(self, before: dict) -> dict[str, tuple[object, object]]:
-        """Before and now, of what differs from a run's earlier settings and what it learns depends on."""
-        before = asdict(Settings(self.method)) | before  # a setting newer than the run had its default
+        """Compare with the earlier settings of a run.
+
+        Args:
+            before: Settings by name, as `dataclasses.asdict` or a JSON file gives them.
+
+        Returns:
+            Old and new value by name, of all settings that differ and affect what is learned.
+        """
+        before = asdict(TrainConfig(self.method)) | before  # a setting newer than the run had its default
         # as they come back from a file: tuples become lists
         old, new = (json.loads(json.dumps(settings)) for settings in (before, asdict(self)))
         return {
             name: (old[name], value) for name, value in new.items() if name not in FREE and old[name] != value
         }
 
-    # Schedules count control steps, not parts of the budget: a run is the beginning of every longer one.
+    # ---- schedules, after `samples` control steps ----------------------------------------------------------
 
     def std(self, samples: int) -> tuple[float, float]:
-        """Standard deviations of leg and arm actions after so many control steps."""
-        way = _way(samples, *self.std_steps)
-        legs, arm = (first * (last / first) ** way for first, last in (self.std_legs, self.std_arm))
+        """Standard deviations of the leg and the arm actions."""
+        progress = _progress(samples, *self.std_steps)
+        legs, arm = (first * (last / first) ** progress for first, last in (self.std_legs, self.std_arm))
         return legs, arm
 
-    def severity(self, samples: int) -> float:
-        """Of the disturbances, in [0, 1], after so many control steps."""
-        return _way(samples, *self.calm)
+    def disturbance_scale(self, samples: int) -> float:
+        """Scale in [0, 1] of noise, pushes and randomization."""
+        return _progress(samples, *self.disturbance_ramp)
 
-    def taught(self, samples: int) -> float:
-        """Part of the teacher's time that is over, in [0, 1], after so many control steps; 1 without one."""
-        return _way(samples, 0.0, self.teacher_steps) if self.teacher else 1.0
+    def distillation_progress(self, samples: int) -> float:
+        """Completed fraction in [0, 1] of the distillation; 1 without a teacher."""
+        return _progress(samples, 0.0, self.distillation_steps) if self.teacher else 1.0
 
-    def advice(self, samples: int) -> float:
-        """Weight of the teacher's advice beside PPO, in [0, 1], after so many control steps."""
-        return 1.0 - _way(samples, self.teacher_steps, self.advice_steps) if self.teacher else 0.0
+    def kickstart_weight(self, samples: int) -> float:
+        """Weight in [0, 1] of the teacher's actions beside PPO; 0 without a teacher."""
+        if not self.teacher:
+            return 0.0
+        return 1.0 - _progress(samples, self.distillation_steps, self.kickstart_steps)
 
-    def ramp(self, samples: int) -> float:
-        """Part of the curriculum that is done, in [0, 1], after so many control steps."""
-        return _way(samples, 0.0, self.curriculum)
+    def curriculum_progress(self, samples: int) -> float:
+        """Completed fraction in [0, 1] of the curriculum."""
+        return _progress(samples, 0.0, self.curriculum)
+
+    # ---- checks --------------------------------------------------------------------------------------------
 
     def check(self) -> None:
-        """Refuse what cannot be run.
+        """Refuse settings that cannot be run.
 
         Raises:
-            UnknownNameError: no such method.
-            TrainingError: a number out of its range.
+            UnknownNameError: There is no such method.
+            TrainingError: A number is out of its range.
         """
         if self.method not in METHODS:
             raise UnknownNameError("method", self.method, METHODS, "--method")
-        for name in ("budget", "envs", "steps", "epochs", "minibatches", "estimator_minibatches", "threads"):
+        for name in (
+            *("budget", "num_envs", "num_steps_per_env", "num_learning_epochs", "num_mini_batches"),
+            *("estimator_mini_batches", "threads"),
+        ):
             if getattr(self, name) < 1:
-                option = name.replace("_", "-")
-                raise TrainingError(f"--{option} {getattr(self, name)}: valid: 1 or more")
-        for option, values in (
-            ("teacher-steps", (self.teacher_steps,)),
-            ("std-legs", self.std_legs),
-            ("std-arm", self.std_arm),
+                raise TrainingError(f"{option(name)} {getattr(self, name)}: valid: 1 or more")
+        for name, values in (
+            ("distillation_steps", (self.distillation_steps,)),
+            ("std_legs", self.std_legs),
+            ("std_arm", self.std_arm),
         ):
             if not min(values) > 0:
-                raise TrainingError(f"--{option} {' '.join(map(str, values))}: valid: more than 0")
+                raise TrainingError(f"{option(name)} {' '.join(map(str, values))}: valid: more than 0")
         begin, end = self.std_steps
         if not 0.0 <= begin < end:
             raise TrainingError(f"--std-steps {begin:g} {end:g}: valid: 0 <= begin < end")
-        begin, end = self.calm
+        begin, end = self.disturbance_ramp
         if not (0.0 <= begin < end or begin == end == 0.0):
-            raise TrainingError(f"--calm {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for never")
+            raise TrainingError(
+                f"--disturbance-ramp {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for no ramp"
+            )
         least, most = self.push_interval
         if not (0.0 < least <= most or least == most == 0.0):
             raise TrainingError(
                 f"--push-interval {least:g} {most:g}: valid: 0 < least <= most, or 0 0 for the protocol's"
             )
-        for name in ("arm_teaching", "posture_teaching"):
+        for name in ("arm_ik_loss", "posture_loss"):
             begin, end = getattr(self, name)
             if not 0.0 <= begin <= end:
-                option = name.replace("_", "-")
                 raise TrainingError(
-                    f"--{option} {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
+                    f"{option(name)} {begin:g} {end:g}: valid: 0 <= begin <= end, or 0 0 for never"
                 )
-        if self.mirror and METHODS[self.method].estimates:
+        if self.symmetry_augmentation and METHODS[self.method].estimates:
             valid = ", ".join(name for name, method in METHODS.items() if not method.estimates)
             raise TrainingError(
-                f"--mirror with --method {self.method}: valid: {valid}, which estimate nothing"
+                f"--symmetry-augmentation with --method {self.method}: valid: {valid}, "
+                "which have no estimator"
             )
-        if self.envs * self.steps < self.minibatches:
+        if self.num_envs * self.num_steps_per_env < self.num_mini_batches:
             raise TrainingError(
-                f"--minibatches {self.minibatches}: valid: 1 to {self.envs * self.steps} (envs x steps)"
+                f"--num-mini-batches {self.num_mini_batches}: valid: 1 to "
+                f"{self.num_envs * self.num_steps_per_env} (num-envs x num-steps-per-env)"
             )
-        if self.estimator_minibatches > self.estimator_envs:
+        if self.estimator_mini_batches > self.estimator_envs:
             raise TrainingError(
-                f"--estimator-minibatches {self.estimator_minibatches}: valid: 1 to {self.estimator_envs} "
-                "(envs x estimator-share)"
+                f"--estimator-mini-batches {self.estimator_mini_batches}: valid: 1 to {self.estimator_envs} "
+                "(num-envs x estimator-share)"
             )
 
     @property
     def estimator_envs(self) -> int:
-        """Environments whose rollouts train the estimator."""
-        return max(1, round(self.envs * self.estimator_share))
+        """Number of environments whose rollouts train the estimator."""
+        return max(1, round(self.num_envs * self.estimator_share))
 
 
-def _way(samples: float, begin: float, end: float) -> float:
-    """Part of the way from `begin` to `end` that is done, in [0, 1]; all of it where there is none."""
+def option(name: str) -> str:
+    """Command-line option of a setting, for error messages: `--num-envs` of `num_envs`."""
+    return f"--{name.replace('_', '-')}"
+
+
+def _progress(samples: float, begin: float, end: float) -> float:
+    """Completed fraction in [0, 1] of the interval from `begin` to `end`; 1 if the interval is empty."""
     return max(0.0, (samples - begin) / (end - begin)) if samples < end else 1.0

@@ -1,4 +1,4 @@
-"""Learning curves of runs, as figures in the style of the bench."""
+"""Learning curves of training runs, as figures in the style of the benchmark."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +13,9 @@ from wbc_baselines.learned.training.run_folder import RunFolder
 from wbc_bench.results.figures.style import DASHES, METHOD_COLOURS, STYLE, save
 
 Rows = list[dict]
-SMOOTHING = 0.03  # of the samples: width of the moving mean
+SMOOTHING = 0.03  # width of the moving mean, as a fraction of the control steps
 PANELS = (  # metric, axis label, factor
-    ("episode/return", "Return of an episode", 1.0),
+    ("episode/return", "Return per episode", 1.0),
     ("episode/success", "Success in training (%)", 100.0),
     ("episode/falls", "Falls in training (%)", 100.0),
     ("episode/pos_error", "Position error at 10 s (cm)", 100.0),
@@ -23,7 +23,15 @@ PANELS = (  # metric, axis label, factor
 
 
 def smooth(rows: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
-    """Samples and the moving mean of a metric, weighted by the episodes that ended."""
+    """Compute the moving mean of a metric, weighted by the number of ended episodes.
+
+    Args:
+        rows: Metrics of all iterations.
+        metric: Name of the metric.
+
+    Returns:
+        Control steps (K,) and means (K,) of the iterations that have the metric.
+    """
     chosen = [row for row in rows if row.get(metric) is not None]
     x = np.array([row["samples"] for row in chosen], dtype=float)
     y = np.array([row[metric] for row in chosen], dtype=float)
@@ -38,7 +46,18 @@ def smooth(rows: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, factor: float) -> Axes:
-    """One metric over millions of control steps; a colour a method, a dash a seed."""
+    """Plot one metric over millions of control steps, with one color per method and one dash per seed.
+
+    Args:
+        ax: Axes to draw on.
+        runs: Name and metrics of each run.
+        metric: Name of the metric.
+        label: Label of the vertical axis.
+        factor: Factor from the metric to the unit of the label.
+
+    Returns:
+        The axes.
+    """
     methods = list(dict.fromkeys(name.split("@")[0] for name, _ in runs))
     for name, rows in runs:
         method, _, seed = name.partition("@")
@@ -57,7 +76,15 @@ def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, f
 
 
 def measured_scores(rows: Rows, part: float = 0.1) -> tuple[float, float, float]:
-    """PHASE, SCORE_M and SCORE_L of `rewards`, measured over the last `part` of a run's iterations."""
+    """Measure the constants PHASE, SCORE_M and SCORE_L of `rewards` in a run.
+
+    Args:
+        rows: Metrics of all iterations.
+        part: Last fraction of the iterations that is used.
+
+    Returns:
+        PHASE, SCORE_M and SCORE_L.
+    """
     last = rows[-max(1, round(part * len(rows))) :]
 
     def mean(gate: str) -> float:
@@ -68,7 +95,16 @@ def measured_scores(rows: Rows, part: float = 0.1) -> tuple[float, float, float]
 
 
 def write_curves(out: Path, figures: Path, name: str = "learning_curves") -> list[Path]:
-    """Draw every run below `out` into `figures`, PNG and SVG; nothing if there is no run."""
+    """Plot all runs below a folder.
+
+    Args:
+        out: Folder of all runs.
+        figures: Folder to write to.
+        name: Name of the files.
+
+    Returns:
+        The PNG and the SVG file; nothing if there is no run.
+    """
     order = list(METHODS)
     folders = sorted(
         (path.parent for path in out.glob("*@*/metrics.jsonl")),

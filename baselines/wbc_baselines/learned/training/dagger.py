@@ -1,8 +1,10 @@
-"""A start for all methods alike: a policy without context that imitates another controller of the bench.
+"""Imitation of another controller of the bench by a policy without a context, to initialize all methods.
 
-DAgger: the teacher answers in every state, but the student drives in a growing part of the episodes, so that
-the states are those a policy meets and not only those a teacher leaves behind. Source: Ross, Gordon, Bagnell
-2011, "A reduction of imitation learning and structured prediction to no-regret online learning".
+DAgger: the teacher gives an action in every state, but the student acts in a growing fraction of the
+episodes, so that the states are those that a policy visits and not only those that a teacher visits.
+
+Source: Ross, Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret
+online learning".
 """
 
 from collections.abc import Callable
@@ -20,9 +22,9 @@ from wbc_baselines.learned.policy.controller import LearnedController
 from wbc_baselines.learned.policy.estimators import make_estimator
 from wbc_baselines.learned.policy.networks import Actor
 from wbc_baselines.learned.policy.policy import flow_of
-from wbc_baselines.learned.training.resets import draw_starts, weakened
+from wbc_baselines.learned.training.resets import sample_episodes, scale_disturbances
 from wbc_baselines.learned.training.symmetry import input_mirror, joint_mirror
-from wbc_baselines.learned.training.target_set import TargetPool
+from wbc_baselines.learned.training.target_set import TargetSet
 from wbc_bench.controller import (
     Controller,
     ControllerInfo,
@@ -39,219 +41,289 @@ from wbc_bench.randomness import stream
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot, load_robot
 
-METHOD = "no_latent"  # the one whose policy has no context
-SHARD = 25  # episodes that are recorded together
-# Of a leg's normalised action; choice: an answer beyond it is one to a fall, and not to be learned. The arm's
-# scales are small (0.2 and 0.3 rad), so that what it needs to reach a target is often 5 and more.
-LIMIT = 3.0
-MOST = 0.9  # of a round's episodes that the student drives; choice
-DELTA = 0.05  # [rad] of the Huber loss; choice
+METHOD = "no_latent"  # the method whose policy has no context
+SHARD = 25  # episodes that are simulated together
+# Of a leg's action, in units of the action scale; choice: a larger one answers a fall and is not to be
+# imitated. The arm's scales are small (0.2 and 0.3 rad), so that reaching a target often takes 5 and more.
+MAX_LEG_ACTION = 3.0
+MAX_STUDENT_FRACTION = 0.9  # of a round's episodes in which the student acts; choice
+HUBER_DELTA = 0.05  # [rad] of the Huber loss; choice
 
-Progress = Callable[[int, int], None]
+Progress = Callable[[int, int], None]  # (done, total) episodes
 
 
-class Lessons(NamedTuple):
-    """What the teacher answered to what a policy sees."""
+class ImitationDataset(NamedTuple):
+    """The teacher's actions for inputs of the policy."""
 
-    seen: NDArray[np.float32]  # (M, 67) observation and command
-    action: NDArray[np.float32]  # (M, 14) normalised
+    inputs: NDArray[np.float32]  # (M, 67) observation and command
+    action: NDArray[np.float32]  # (M, 14) in units of the action scale
 
     @classmethod
-    def joined(cls, parts: "list[Lessons]") -> "Lessons":
+    def joined(cls, parts: "list[ImitationDataset]") -> "ImitationDataset":
+        """Concatenate datasets in their order."""
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
-    def with_mirror_images(self, robot: Robot) -> "Lessons":
-        """Twice the lessons: each also with left and right exchanged."""
-        images = Lessons(input_mirror(robot)(self.seen), joint_mirror(robot)(self.action))
-        return Lessons.joined([self, images])
+    def with_mirror_images(self, robot: Robot) -> "ImitationDataset":
+        """Append the mirror image of every sample, left and right exchanged."""
+        images = ImitationDataset(input_mirror(robot)(self.inputs), joint_mirror(robot)(self.action))
+        return ImitationDataset.joined([self, images])
 
 
-class _Driver:
-    """The engine of the student: drives where it is told to, and leaves the rest to the teacher."""
+class _StudentEngine:
+    """The engine of the student: its actions where it acts, and the teacher's elsewhere."""
 
     flow = flow_of(make_estimator("none"))
 
-    def __init__(self, student: Actor | None, drives: Tensor) -> None:
-        self.student, self.drives = student, drives
-        self.answer, self.seen = torch.empty(0), torch.empty(0)
+    def __init__(self, student: Actor | None, student_acts: Tensor) -> None:
+        self.student, self.student_acts = student, student_acts
+        self.teacher_action, self.inputs = torch.empty(0), torch.empty(0)
 
     def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        self.seen = torch.cat([values["observation"], values["command"]], dim=-1)
-        action = self.answer
+        self.inputs = torch.cat([values["observation"], values["command"]], dim=-1)
+        action = self.teacher_action
         if self.student:
-            action = torch.where(self.drives[:, None], self.student(self.seen), action)
+            action = torch.where(self.student_acts[:, None], self.student(self.inputs), action)
         return {"action": action}
 
 
-class Pupil:
-    """A controller in which teacher and student see the same episodes, and one of them drives each."""
+class DaggerController:
+    """A controller in which teacher and student observe the same episodes, and one of them acts in each."""
 
     def __init__(
-        self, robot: Robot, protocol: EvalProtocol, teacher: Controller, student: Actor | None, drives: Tensor
+        self,
+        robot: Robot,
+        protocol: EvalProtocol,
+        teacher: Controller,
+        student: Actor | None,
+        student_acts: Tensor,
     ) -> None:
-        self._teacher, self._robot, self._driver = teacher, robot, _Driver(student, drives)
+        """Combine a teacher and a student.
+
+        Args:
+            robot: Robot of the protocol.
+            protocol: Protocol of the episodes.
+            teacher: Controller whose actions are recorded.
+            student: Policy without a context, or None where the teacher always acts.
+            student_acts: (N,) bool Episodes in which the student acts.
+        """
+        self._teacher, self._robot, self._engine = teacher, robot, _StudentEngine(student, student_acts)
         card = new_card(METHOD, 0, 0, 0.0, protocol)
-        self._hands = LearnedController(robot, card, self._driver, "pupil", "")
-        signals = teacher.info.signals | self._hands.info.signals
-        self.info = ControllerInfo("pupil", signals, protocol.control_period, "wbc_baselines.learned")
-        self.lessons: list[Lessons] = []
+        self._student = LearnedController(robot, card, self._engine, "dagger", "")
+        signals = teacher.info.signals | self._student.info.signals
+        self.info = ControllerInfo("dagger", signals, protocol.control_period, "wbc_baselines.learned")
+        self.recorded: list[ImitationDataset] = []
 
     def prepare(self, protocol: EvalProtocol) -> None:
-        for part in (self._teacher, self._hands):
+        """See `wbc_bench.controller.ProtocolAware`."""
+        for part in (self._teacher, self._student):
             if isinstance(part, ProtocolAware):
                 part.prepare(protocol)
 
     def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
+        """See `wbc_bench.controller.Controller`."""
         self._teacher.reset(episodes, obs, target)
-        self._hands.reset(episodes, obs, target)
+        self._student.reset(episodes, obs, target)
 
     def act(self, obs: Observation, target: Target) -> JointCommand:
+        """Act, and record the teacher's action wherever it is fit to be imitated."""
         wanted = self._robot.action_of(self._teacher.act(obs, target).q)
-        self._driver.answer = torch.from_numpy(wanted.astype(np.float32))
-        command = self._hands.act(obs, target)
-        sound = obs.active & (np.abs(wanted[:, :NUM_LEG_JOINTS]) < LIMIT).all(axis=1)
-        self.lessons.append(Lessons(self._driver.seen.numpy()[sound], wanted[sound].astype(np.float32)))
+        self._engine.teacher_action = torch.from_numpy(wanted.astype(np.float32))
+        command = self._student.act(obs, target)
+        kept = obs.active & (np.abs(wanted[:, :NUM_LEG_JOINTS]) < MAX_LEG_ACTION).all(axis=1)
+        inputs = self._engine.inputs.numpy()[kept]
+        self.recorded.append(ImitationDataset(inputs, wanted[kept].astype(np.float32)))
         return command
 
 
 def record(
     spec: str,
     protocol: EvalProtocol,
-    pool: TargetPool,
+    target_set: TargetSet,
     episodes: int,
     seed: int,
     student: Actor | None = None,
-    share: float = 0.0,
+    student_fraction: float = 0.0,
     workers: int = 1,
     progress: Progress = lambda done, total: None,
-) -> Lessons:
-    """Lessons of `episodes` episodes, in a part `share` of which the student drives; for any `workers`.
+) -> ImitationDataset:
+    """Simulate episodes and record the teacher's actions.
 
-    Targets come from training's pool and draws from streams of training's own, so no evaluation meets them.
+    Targets come from training's set and samples from streams of training's own, so no evaluation shares them.
+
+    Args:
+        spec: SPEC of the teacher.
+        protocol: Protocol of the episodes.
+        target_set: Targets that episodes pick from.
+        episodes: Number of episodes.
+        seed: Seed of all samples.
+        student: Policy without a context, or None where the teacher always acts.
+        student_fraction: Probability with which the student acts in an episode.
+        workers: Number of processes; the result does not depend on it.
+        progress: Is called with completed and total episodes.
+
+    Returns:
+        The dataset of all episodes.
     """
     state = student.state_dict() if student else None
+    common = spec, protocol, target_set, seed
     jobs = (
-        delayed(_record_shard)(spec, protocol, pool, seed, k, min(SHARD, episodes - first), state, share)
+        delayed(_record_shard)(*common, k, min(SHARD, episodes - first), state, student_fraction)
         for k, first in enumerate(range(0, episodes, SHARD))
     )
-    parts: list[Lessons] = []
+    parts: list[ImitationDataset] = []
     found: Any = Parallel(n_jobs=workers, return_as="generator")(jobs)
     for part in found:
         parts.append(part)
         progress(min(len(parts) * SHARD, episodes), episodes)
-    return Lessons.joined(parts)
+    return ImitationDataset.joined(parts)
 
 
 def _record_shard(
     spec: str,
     protocol: EvalProtocol,
-    pool: TargetPool,
+    target_set: TargetSet,
     seed: int,
     number: int,
     count: int,
     student_state: dict | None,
-    share: float,
-) -> Lessons:
+    student_fraction: float,
+) -> ImitationDataset:
     student = None
     if student_state:
         student = Actor(0)
         student.load_state_dict(student_state)
     rng = stream(seed, "lessons", number)
-    robot, rows = load_robot(protocol.robot), draw_rows(protocol, pool, count, rng)
-    drives = torch.from_numpy(rng.random(count) < share)
-    pupil = Pupil(robot, protocol, load_controller(spec, robot), student, drives)
-    for _ in ControlLoop(pupil, protocol, rows).run():
-        pass  # the pupil keeps what is wanted
-    return Lessons.joined(pupil.lessons)
+    robot, rows = load_robot(protocol.robot), sample_manifest(protocol, target_set, count, rng)
+    student_acts = torch.from_numpy(rng.random(count) < student_fraction)
+    controller = DaggerController(robot, protocol, load_controller(spec, robot), student, student_acts)
+    for _ in ControlLoop(controller, protocol, rows).run():
+        pass  # the controller records
+    return ImitationDataset.joined(controller.recorded)
 
 
-def draw_rows(
-    protocol: EvalProtocol, pool: TargetPool, count: int, rng: np.random.Generator
+def sample_manifest(
+    protocol: EvalProtocol, target_set: TargetSet, count: int, rng: np.random.Generator
 ) -> EpisodeManifest:
-    """Training's episodes as rows of a manifest."""
-    draws = draw_starts(protocol, pool, count, rng)
-    chosen, push_step = draws.target, draws.push_step.numpy()
-    pos = pool.pos_w[chosen].astype(np.float64)
+    """Sample training episodes as rows of a manifest.
+
+    Args:
+        protocol: Protocol of the episodes.
+        target_set: Targets that episodes pick from.
+        count: Number of episodes.
+        rng: Random generator.
+
+    Returns:
+        A manifest of `count` episodes.
+    """
+    samples = sample_episodes(protocol, target_set, count, rng)
+    chosen, push_step = samples.target, samples.push_step.numpy()
+    pos = target_set.pos_w[chosen].astype(np.float64)
     none, number = np.full(count, "", dtype=object), np.arange(count)
     return EpisodeManifest(
         replicate=np.zeros(count, np.int64),
         episode=number,
-        stratum=np.array([STRATA[k] for k in pool.stratum[chosen]], dtype=object),
+        stratum=np.array([STRATA[k] for k in target_set.stratum[chosen]], dtype=object),
         condition=none,
         orientation=none,
         height=pos[:, 2],
         target_pos_w=pos,
-        target_quat_w=pool.quat_w[chosen].astype(np.float64),
+        target_quat_w=target_set.quat_w[chosen].astype(np.float64),
         witness_qpos=np.full((count, 21), np.nan),
-        **{name: column.numpy() for name, column in draws.start._asdict().items()},
+        **{name: column.numpy() for name, column in samples.reset._asdict().items()},
         push_time=np.where(push_step < 0, np.nan, push_step * protocol.control_period),
-        push_vel=draws.push_vel.numpy().reshape(count, -1),
+        push_vel=samples.push_vel.numpy().reshape(count, -1),
         noise_key=rng.integers(2**63 - 1, size=count),
         noise_scale=np.ones(count),
     )
 
 
 def fit(
-    lessons: Lessons,
+    dataset: ImitationDataset,
     robot: Robot,
     seed: int,
-    start: Actor | None = None,
+    init: Actor | None = None,
     updates: int = 3000,
     batch: int = 1024,
     learning_rate: float = 1e-3,
 ) -> tuple[Actor, float]:
-    """The policy that answers most like the teacher, and its root mean square error [rad] on unseen lessons.
+    """Fit a policy to the teacher's actions and their mirror images.
 
-    Every lesson counts with its mirror image. Joints count by the angles asked for, actions times the
-    action scale; errors beyond DELTA count linearly, since what a teacher answers to a robot that is lost is
-    wild. It goes on from a `start`, in place; without one, from random weights with the lessons' normalisers.
-    The newest fiftieth of the lessons is held out. The learning rate falls to zero along a cosine.
+    The loss is a Huber loss of joint angles, that is actions times the action scale: errors beyond
+    HUBER_DELTA count linearly, because a teacher's actions in hopeless states are erratic. The newest
+    fiftieth of the dataset is held out. The learning rate decays to zero along a cosine.
+
+    Args:
+        dataset: Inputs and actions.
+        robot: Robot, for the action scale and the mirror images.
+        seed: Seed of the initial weights and of the mini-batches.
+        init: Policy that is trained further, in place; None for random weights and the dataset's statistics.
+        updates: Number of updates.
+        batch: Samples per update.
+        learning_rate: Initial learning rate.
+
+    Returns:
+        The policy, and its root mean square error [rad] on the held-out samples.
     """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
-    known = len(lessons.seen) - len(lessons.seen) // 50
-    held, kept = (Lessons(*(x[part] for x in lessons)) for part in (slice(known, None), slice(known)))
-    seen, action = map(torch.from_numpy, kept.with_mirror_images(robot))
+    known = len(dataset.inputs) - len(dataset.inputs) // 50
+    parts = slice(known, None), slice(known)
+    held, kept = (ImitationDataset(*(column[part] for column in dataset)) for part in parts)
+    inputs, action = map(torch.from_numpy, kept.with_mirror_images(robot))
     radians = torch.tensor(robot.action_scale, dtype=torch.float32)
-    actor = start
+    actor = init
     if actor is None:
         actor = Actor(0)
-        actor.normalizer.update(seen)
+        actor.normalizer.update(inputs)
     optimizer = torch.optim.Adam(actor.mlp.parameters(), learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, updates)
     for _ in range(updates):
-        chosen = torch.randint(len(seen), (batch,), generator=generator)
-        loss = huber_loss(radians * actor(seen[chosen]), radians * action[chosen], delta=DELTA)
+        chosen = torch.randint(len(inputs), (batch,), generator=generator)
+        loss = huber_loss(radians * actor(inputs[chosen]), radians * action[chosen], delta=HUBER_DELTA)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         schedule.step()
     with torch.no_grad():
-        answers = actor(torch.from_numpy(held.seen))
+        answers = actor(torch.from_numpy(held.inputs))
         error = (radians * (answers - torch.from_numpy(held.action))).square().mean().sqrt()
     return actor.eval(), float(error)
 
 
-def imitate(
+def dagger(
     spec: str,
     protocol: EvalProtocol,
-    pool: TargetPool,
+    target_set: TargetSet,
     episodes: int,
     rounds: int,
     seed: int,
-    calm: int = 0,
+    undisturbed_rounds: int = 0,
     updates: int = 3000,
     workers: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> tuple[Actor, float]:
-    """DAgger: `rounds` of `episodes` each; the student drives a quarter more of them every round, up to MOST.
+    """Imitate a controller by DAgger.
 
-    In the first `calm` rounds nothing disturbs the robot; then disturbances rise evenly, to the protocol's in
-    the last round.
+    The fraction of episodes in which the student acts grows by a quarter per round, up to
+    MAX_STUDENT_FRACTION. After the undisturbed rounds, disturbances grow linearly to the protocol's in the
+    last round.
 
-    Returns the policy fitted to all lessons, and its root mean square error [rad] on the newest fiftieth.
+    Args:
+        spec: SPEC of the teacher.
+        protocol: Protocol of the episodes.
+        target_set: Targets that episodes pick from.
+        episodes: Number of episodes per round.
+        rounds: Number of rounds.
+        seed: Seed of all samples and of the initial weights.
+        undisturbed_rounds: Number of first rounds without noise, pushes and randomization.
+        updates: Number of updates after each round.
+        workers: Number of processes; the result does not depend on it.
+        progress: Is called with completed and total episodes.
+
+    Returns:
+        The policy fitted to the data of all rounds, and its root mean square error [rad] on held-out samples.
     """
-    parts: list[Lessons] = []
+    parts: list[ImitationDataset] = []
     robot = load_robot(protocol.robot)
     student, error = None, float("nan")
     for k in range(rounds):
@@ -260,9 +332,10 @@ def imitate(
             progress(before + done, rounds * episodes)
 
         key = seed * rounds + k
-        share, severity = min(MOST, k / 4), max(0.0, (k + 1 - calm) / (rounds - calm))
-        disturbed = weakened(protocol, severity)
-        parts.append(record(spec, disturbed, pool, episodes, key, student, share, workers, told))
-        student, error = fit(Lessons.joined(parts), robot, seed, student, updates)
+        fraction = min(MAX_STUDENT_FRACTION, k / 4)
+        scale = max(0.0, (k + 1 - undisturbed_rounds) / (rounds - undisturbed_rounds))
+        disturbed = scale_disturbances(protocol, scale)
+        parts.append(record(spec, disturbed, target_set, episodes, key, student, fraction, workers, told))
+        student, error = fit(ImitationDataset.joined(parts), robot, seed, student, updates)
     assert student is not None
     return student, error

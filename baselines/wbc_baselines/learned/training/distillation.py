@@ -1,11 +1,12 @@
-"""A policy that learns from teachers beside it, in the states that its own rollouts meet.
+"""Imitation losses that are computed on the states of the policy's own rollouts.
 
-What is known need not be found out by reinforcement. A teacher answers in every state of a rollout and the
-policy is fitted to the answers: a checkpoint that knows more (alone at first, then beside PPO, less and
-less), or geometry: for the arm, while PPO teaches the legs to carry it, and for legs that stand short of the
-target. Source: Ross, Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to
-no-regret online learning"; Schmitt et al. 2018, "Kickstarting deep reinforcement learning", for a teacher
-that fades.
+Behavior that is known in advance need not be discovered by reinforcement learning. A teacher gives an action
+for every state of a rollout, and the policy is fitted to it: a checkpoint with more information (alone at
+first, then beside PPO with a decreasing weight), the inverse kinematics of the arm, and leg postures that
+reach the target.
+
+Source: Ross, Gordon, Bagnell 2011, "A reduction of imitation learning and structured prediction to no-regret
+online learning"; Schmitt et al. 2018, "Kickstarting deep reinforcement learning", for the decreasing weight.
 """
 
 import math
@@ -19,46 +20,64 @@ from torch.nn.functional import huber_loss
 from wbc_baselines.learned.policy.checkpoint import Checkpoint
 from wbc_baselines.learned.policy.inputs import COMMAND, OBSERVATION, OBSERVATION_LAYOUT, columns
 from wbc_baselines.learned.training.arm_ik import ArmKinematics
-from wbc_baselines.learned.training.dagger import DELTA
-from wbc_baselines.learned.training.environment import ARRIVES, PRIVILEGED_COLUMNS
+from wbc_baselines.learned.training.dagger import HUBER_DELTA
+from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS
+from wbc_baselines.learned.training.state_view import ARRIVAL_REFERENCE
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 
-PARTS = 18  # of a rollout's lessons, an update each; choice, 1024 lessons a part of 768 x 24
-EPOCHS = 4  # over the lessons of a rollout; choice
-RATE, LEAST_RATE = 5e-4, 2e-5  # of Adam, first and last; choice
-BESIDE_RATE = 3e-4  # of Adam, of lessons beside PPO; choice
-BLEND = 0.3  # of the way from the policy's answer to the taught one, an iteration beside PPO; choice
-SHARE = 0.25  # of a rollout's states that are lessons beside PPO; choice: geometry costs as much as physics
-LEG_RATE, LEG_BLEND = 5e-5, 0.02  # the same of the legs, which PPO has to balance meanwhile; choice
-REACHED = 0.05  # [m] within which the arm alone brings the hand to its target, or there is no lesson; choice
-SETS_OUT = 2.0  # of the task-progress reference, below which the arm leaves its default; choice
+MINI_BATCHES = 18  # updates per pass; choice: 1024 states per update for a rollout of 768 x 24
+EPOCHS = 4  # passes of the distillation over each rollout; choice
+INITIAL_LEARNING_RATE, FINAL_LEARNING_RATE = 5e-4, 2e-5  # of the distillation; choice
+AUXILIARY_LEARNING_RATE = 3e-4  # of the losses beside PPO; choice
+TARGET_STEP = 0.3  # fraction of the way from the policy's to the teacher's action, per iteration; choice
+SAMPLE_FRACTION = 0.25  # of a rollout's states in a loss beside PPO; choice: inverse kinematics is expensive
+# The same for the legs, far smaller because PPO has to keep the balance meanwhile; choice.
+LEG_LEARNING_RATE, LEG_TARGET_STEP = 5e-5, 0.02
+REACHED = 0.05  # [m] largest position error of an inverse-kinematics solution that is imitated; choice
+DEPARTURE_REFERENCE = 2.0  # task-progress reference below which the arm leaves its default; choice
 LEGS, ARM = slice(NUM_LEG_JOINTS), slice(NUM_LEG_JOINTS, NUM_JOINTS)
 GRAVITY, JOINT_POS, REFERENCE = (
     columns(OBSERVATION_LAYOUT, term) for term in ("projected gravity", "joint positions", "task-progress")
 )
 
 
-class Fit:
-    """Supervised updates of rsl-rl's actor."""
+class SupervisedUpdate:
+    """Supervised updates of the mean of rsl-rl's actor."""
 
     def __init__(self, actor: MLPModel, action_scale: Tensor) -> None:
-        """action_scale (14,) [rad]."""
+        """Create an optimizer of its own for the actor's network.
+
+        Args:
+            actor: The policy to update.
+            action_scale: (14,) [rad] Joint angle per unit of action.
+        """
         self._actor, self._radians = actor, action_scale
-        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), RATE)
+        self.optimizer = torch.optim.Adam(actor.mlp.parameters(), INITIAL_LEARNING_RATE)
 
     @torch.no_grad()
     def means(self, observations: TensorDict) -> Tensor:
-        """What the policy (M, 14) itself would do, to be changed."""
+        """Return a copy of the policy's mean actions (M, 14), which the caller may modify."""
         return self._actor(observations).clone()
 
-    def update(self, observations: TensorDict, action: Tensor, rate: float, epochs: int) -> float:
-        """Fit the means to actions (M, 14) wanted in M states; the mean of `imitation.fit`'s loss [rad^2]."""
+    def update(self, observations: TensorDict, action: Tensor, learning_rate: float, epochs: int) -> float:
+        """Fit the policy's mean to target actions.
+
+        Args:
+            observations: Observation groups of M states.
+            action: (M, 14) Target actions.
+            learning_rate: Learning rate of Adam.
+            epochs: Passes over the states.
+
+        Returns:
+            The mean Huber loss [rad^2] over all updates, as in `dagger.fit`.
+        """
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = learning_rate
         wanted, losses = self._radians * action, []
         for _ in range(epochs):
-            for part in torch.randperm(len(wanted), device=wanted.device).chunk(PARTS):
-                loss = huber_loss(self._radians * self._actor(observations[part]), wanted[part], delta=DELTA)
+            for part in torch.randperm(len(wanted), device=wanted.device).chunk(MINI_BATCHES):
+                answer = self._radians * self._actor(observations[part])
+                loss = huber_loss(answer, wanted[part], delta=HUBER_DELTA)
                 self.optimizer.zero_grad()
                 loss.backward()
                 self.optimizer.step()
@@ -66,51 +85,82 @@ class Fit:
         return float(torch.stack(losses).mean())
 
 
-def _some(observations: TensorDict) -> TensorDict:
-    """A share (M,) of the states of a rollout (T, N)."""
+def sample_states(observations: TensorDict) -> TensorDict:
+    """Draw SAMPLE_FRACTION of the states of a rollout (T, N) without replacement, as (M,)."""
     flat = observations.flatten(0, 1)
-    return flat[torch.randperm(len(flat), device=flat.device)[: math.ceil(SHARE * len(flat))]]
+    return flat[torch.randperm(len(flat), device=flat.device)[: math.ceil(SAMPLE_FRACTION * len(flat))]]
 
 
-class Teaching:
-    """All joints, from a checkpoint."""
+class Distillation:
+    """Imitation of a teacher checkpoint with all joints."""
 
     def __init__(self, teacher: Checkpoint, actor: MLPModel, action_scale: Tensor) -> None:
-        """action_scale (14,) [rad]."""
-        self._teacher, self.fit = teacher.actor.to(action_scale.device), Fit(actor, action_scale)
+        """Take a teacher and the policy that imitates it.
+
+        Args:
+            teacher: Checkpoint of a method without an estimator.
+            actor: The policy to update.
+            action_scale: (14,) [rad] Joint angle per unit of action.
+        """
+        self._teacher = teacher.actor.to(action_scale.device)
+        self.supervised = SupervisedUpdate(actor, action_scale)
         self._privileged = teacher.estimator.context_dim > 0
 
     @torch.no_grad()
-    def answer(self, observations: TensorDict) -> Tensor:
-        """The teacher's actions (..., 14)."""
+    def actions(self, observations: TensorDict) -> Tensor:
+        """Return the teacher's actions (..., 14) in the given states (...)."""
         seen = observations["policy"]
         if self._privileged:
             seen = torch.cat([seen, observations["critic"][..., PRIVILEGED_COLUMNS]], -1)
         return self._teacher(seen)
 
-    def update(self, observations: TensorDict, way: float) -> dict[str, float]:
-        """Learn from the states of a rollout (T, N), `way` in [0, 1] of the teacher's time being over."""
-        rate = LEAST_RATE + (RATE - LEAST_RATE) * 0.5 * (1 + math.cos(math.pi * way))
+    def update(self, observations: TensorDict, progress: float) -> dict[str, float]:
+        """Fit the policy to the teacher alone, in all states of a rollout.
+
+        Args:
+            observations: Observation groups of a rollout (T, N).
+            progress: Completed fraction in [0, 1] of the distillation, which anneals the learning rate.
+
+        Returns:
+            The loss by name.
+        """
+        annealed = 0.5 * (1 + math.cos(math.pi * progress))
+        rate = FINAL_LEARNING_RATE + (INITIAL_LEARNING_RATE - FINAL_LEARNING_RATE) * annealed
         flat = observations.flatten(0, 1)
-        return {"teaching": self.fit.update(flat, self.answer(flat), rate, epochs=EPOCHS)}
+        return {"distillation": self.supervised.update(flat, self.actions(flat), rate, epochs=EPOCHS)}
 
-    def advise(self, observations: TensorDict, weight: float) -> dict[str, float]:
-        """Learn beside PPO from a share of the states of a rollout (T, N), with a weight in [0, 1]."""
-        flat = _some(observations)
-        own = self.fit.means(flat)
-        wanted = own + BLEND * weight * (self.answer(flat) - own)
-        return {"advice": self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)}
+    def kickstart(self, observations: TensorDict, weight: float) -> dict[str, float]:
+        """Move the policy toward the teacher beside PPO, in a sample of the states of a rollout.
+
+        Args:
+            observations: Observation groups of a rollout (T, N).
+            weight: Weight of the teacher's actions in [0, 1].
+
+        Returns:
+            The loss by name.
+        """
+        flat = sample_states(observations)
+        own = self.supervised.means(flat)
+        wanted = own + TARGET_STEP * weight * (self.actions(flat) - own)
+        return {"kickstart": self.supervised.update(flat, wanted, AUXILIARY_LEARNING_RATE, epochs=1)}
 
 
-class ArmTeaching:
-    """The joints of the arm, from its inverse kinematics; the legs stay with what the policy wants.
+class ArmIKLoss:
+    """Imitation of the arm's inverse kinematics by the arm joints; the leg actions stay as they are.
 
-    The arm sets out as the task-progress reference falls, and its commands bear its weight.
+    The target moves from the default posture to the inverse-kinematics solution while the task-progress
+    reference falls, and contains the deflection that holds the arm's weight.
     """
 
     def __init__(self, robot: Robot, actor: MLPModel, action_scale: Tensor) -> None:
-        """action_scale (14,) [rad]."""
-        self.fit = Fit(actor, action_scale)
+        """Take the robot's arm and the policy that imitates.
+
+        Args:
+            robot: Robot with the arm.
+            actor: The policy to update.
+            action_scale: (14,) [rad] Joint angle per unit of action.
+        """
+        self.supervised = SupervisedUpdate(actor, action_scale)
         self._arm, self._scale = ArmKinematics(robot, action_scale.device), action_scale[ARM]
         self._default, self._kp = (
             torch.tensor(x[ARM], dtype=torch.float32, device=action_scale.device)
@@ -118,49 +168,69 @@ class ArmTeaching:
         )
 
     @torch.no_grad()
-    def answer(self, observations: TensorDict) -> tuple[Tensor, Tensor]:
-        """Actions (M, 6) of the arm on the way to the target, and whether (M,) it gets there."""
+    def actions(self, observations: TensorDict) -> tuple[Tensor, Tensor]:
+        """Return the arm's target actions (M, 6), and whether (M,) the arm reaches the target."""
         seen = observations["critic"]  # without noise
         q, command = self._default + seen[:, JOINT_POS][:, ARM], seen[:, OBSERVATION:][:, :COMMAND]
-        there = self._arm.solve(q, command)
-        miss = torch.linalg.vector_norm(self._arm.hand(there)[0] - command[:, :3], dim=-1)
-        way = ((SETS_OUT - seen[:, REFERENCE]) / (SETS_OUT - ARRIVES)).clamp(0, 1)
-        weight = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp
-        return (way * (there - self._default) + weight) / self._scale, miss < REACHED
+        solution = self._arm.solve(q, command)
+        error = torch.linalg.vector_norm(self._arm.hand(solution)[0] - command[:, :3], dim=-1)  # [m]
+        progress = (DEPARTURE_REFERENCE - seen[:, REFERENCE]) / (DEPARTURE_REFERENCE - ARRIVAL_REFERENCE)
+        deflection = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp  # [rad]
+        wanted = progress.clamp(0, 1) * (solution - self._default) + deflection
+        return wanted / self._scale, error < REACHED
 
     def update(self, observations: TensorDict) -> dict[str, float]:
-        """Learn from a share of the states of a rollout (T, N); the root mean square miss [rad] before."""
-        flat = _some(observations)
-        answer, reached = self.answer(flat)
+        """Move the arm's actions toward the targets, in a sample of the states of a rollout (T, N).
+
+        Args:
+            observations: Observation groups of a rollout (T, N).
+
+        Returns:
+            The root mean square difference [rad] before the update, by name; empty if no target is in reach.
+        """
+        flat = sample_states(observations)
+        target, reached = self.actions(flat)
         if not reached.any():
             return {}
-        flat, answer = flat[reached], answer[reached]
-        wanted = self.fit.means(flat)
-        miss = self._scale * (answer - wanted[:, ARM])
-        wanted[:, ARM] += BLEND * (answer - wanted[:, ARM])
-        self.fit.update(flat, wanted, BESIDE_RATE, epochs=1)
-        return {"arm_teaching": float(miss.square().mean().sqrt())}
+        flat, target = flat[reached], target[reached]
+        wanted = self.supervised.means(flat)
+        difference = self._scale * (target - wanted[:, ARM])
+        wanted[:, ARM] += TARGET_STEP * (target - wanted[:, ARM])
+        self.supervised.update(flat, wanted, AUXILIARY_LEARNING_RATE, epochs=1)
+        return {"arm_ik": float(difference.square().mean().sqrt())}
 
 
-class PostureTeaching:
-    """The legs, from a posture that reaches the target, where the robot stands still and its hand is late.
+class PostureLoss:
+    """Imitation of a leg posture that reaches the target, where a robot stands still and its hand is late.
 
-    Their commands move by a part of what the measured posture lacks: whatever torque it takes, where the
-    posture is reached nothing is asked for any more. How to stay up on the way is left to PPO.
+    The leg actions move by a fraction of the difference between the measured and the wanted posture, whatever
+    torque this takes; where the posture is reached, nothing is changed any more. Balance is left to PPO.
     """
 
     def __init__(self, actor: MLPModel, action_scale: Tensor) -> None:
-        """action_scale (14,) [rad]."""
-        self.fit, self._scale = Fit(actor, action_scale), action_scale[LEGS]
+        """Take the policy that imitates.
+
+        Args:
+            actor: The policy to update.
+            action_scale: (14,) [rad] Joint angle per unit of action.
+        """
+        self.supervised, self._scale = SupervisedUpdate(actor, action_scale), action_scale[LEGS]
 
     def update(self, observations: TensorDict) -> dict[str, float]:
-        """Learn from the states of a rollout (T, N); the root mean square lack [rad]."""
+        """Move the leg actions toward the postures, wherever `leg_posture_error` is not zero.
+
+        Args:
+            observations: Observation groups of a rollout (T, N).
+
+        Returns:
+            The root mean square posture error [rad] by name; empty where there is none.
+        """
         flat = observations.flatten(0, 1)
-        flat = flat[flat["lack"].any(-1)]
+        flat = flat[flat["leg_posture_error"].any(-1)]
         if len(flat) == 0:
             return {}
-        lack = flat["lack"]
-        wanted = self.fit.means(flat)
-        wanted[:, LEGS] += LEG_BLEND * lack / self._scale
-        self.fit.update(flat, wanted, LEG_RATE, epochs=1)
-        return {"posture_teaching": float(lack.square().mean().sqrt())}
+        error = flat["leg_posture_error"]
+        wanted = self.supervised.means(flat)
+        wanted[:, LEGS] += LEG_TARGET_STEP * error / self._scale
+        self.supervised.update(flat, wanted, LEG_LEARNING_RATE, epochs=1)
+        return {"posture": float(error.square().mean().sqrt())}

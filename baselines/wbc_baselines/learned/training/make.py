@@ -1,48 +1,66 @@
-"""The training environment of a configuration."""
+"""Construction of the training environment from a configuration."""
 
 import msgspec
 
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.environment import Environment
-from wbc_baselines.learned.training.target_set import TargetPool, read_pool
+from wbc_baselines.learned.training.target_set import TargetSet, read_target_set
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 
 
-def training_protocol(settings: Settings) -> EvalProtocol:
-    """The protocol with the physics step and the pushes of training.
+def training_protocol(config: TrainConfig) -> EvalProtocol:
+    """Return the protocol of a configuration with the physics step and the pushes of training.
+
+    Args:
+        config: Configuration of the run.
+
+    Returns:
+        The changed protocol.
 
     Raises:
-        TrainingError: the control period would not be the protocol's.
+        TrainingError: The control period would differ from the protocol's.
     """
-    protocol, _ = find_protocol(settings.protocol)
+    protocol, _ = find_protocol(config.protocol)
     physics = msgspec.structs.replace(
-        protocol.physics, timestep=settings.timestep, decimation=settings.decimation
+        protocol.physics, timestep=config.timestep, decimation=config.decimation
     )
     changed = msgspec.structs.replace(protocol, physics=physics)
-    if settings.push_interval[1]:
-        push = msgspec.structs.replace(protocol.push, interval=settings.push_interval)
+    if config.push_interval[1]:
+        push = msgspec.structs.replace(protocol.push, interval=config.push_interval)
         changed = msgspec.structs.replace(changed, push=push)
     if abs(changed.control_period - protocol.control_period) > 1e-9:
         raise TrainingError(
-            f"--timestep {settings.timestep:g} s x --decimation {settings.decimation}: valid: a product of "
+            f"--timestep {config.timestep:g} s x --decimation {config.decimation}: valid: a product of "
             f"{protocol.control_period:g} s, the control period of {protocol.name}"
         )
     return changed
 
 
-def make_environment(settings: Settings, pool: TargetPool | None = None) -> Environment:
-    """The environment of a run; the pool that ships, if none is given."""
-    protocol = training_protocol(settings)
-    if settings.backend == "warp":
+def make_environment(config: TrainConfig, target_set: TargetSet | None = None) -> Environment:
+    """Build the environment of a run.
+
+    Args:
+        config: Configuration of the run.
+        target_set: Targets that episodes pick from; None for the set that ships with the package.
+
+    Returns:
+        The environment, with its first episodes begun.
+
+    Raises:
+        TrainingError: The physics step does not fit the protocol, or the backend is not available.
+        ManifestError: The target set is missing or was generated for another protocol.
+    """
+    protocol = training_protocol(config)
+    if config.backend == "warp":
         from wbc_baselines.learned.training.backends.warp import WarpBackend
 
-        backend = WarpBackend(protocol, settings.envs)
+        backend = WarpBackend(protocol, config.num_envs)
     else:
         from wbc_baselines.learned.training.backends.cpu import CpuBackend
 
-        backend = CpuBackend(protocol, settings.envs, settings.threads)
-    if pool is None:
-        pool = read_pool(find_protocol(settings.protocol)[0])
-    reward = METHODS[settings.method].reward
-    return Environment(protocol, backend, pool, reward, settings.seed, settings.severity(0))
+        backend = CpuBackend(protocol, config.num_envs, config.threads)
+    if target_set is None:
+        target_set = read_target_set(find_protocol(config.protocol)[0])
+    reward = METHODS[config.method].reward
+    return Environment(protocol, backend, target_set, reward, config.seed, config.disturbance_scale(0))

@@ -1,4 +1,4 @@
-"""What an episode of training draws: the evaluation's quantities and ranges, many episodes at once."""
+"""Random samples of training episodes: the quantities and ranges of an evaluation, many episodes at once."""
 
 from typing import Any, NamedTuple
 
@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.training.backends.base import Start
-from wbc_baselines.learned.training.target_set import TargetPool
+from wbc_baselines.learned.training.backends.base import ResetState
+from wbc_baselines.learned.training.target_set import TargetSet
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
 from wbc_bench.episodes.randomization import resting_height
 from wbc_bench.outcomes import STRATA
@@ -17,61 +17,89 @@ from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
 Array = NDArray[np.float64]
 DECAY = (0.5, 1.4)  # [1/s] v_ref in training. Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
-# Shares of arm, posture and step at the start of a curriculum; choice. It ends at the protocol's weights.
-FIRST_SHARES = np.array([0.6, 0.3, 0.1])
+# Of arm, posture and step at the start of a curriculum; choice. It ends at the protocol's weights.
+INITIAL_STRATUM_PROBABILITIES = np.array([0.6, 0.3, 0.1])
 
 
-class Draws(NamedTuple):
-    """K episodes."""
+class EpisodeSamples(NamedTuple):
+    """Everything that is random about K episodes, except for the observation noise."""
 
-    start: Start
-    target: NDArray[np.int64]  # (K,) row of the pool
+    reset: ResetState
+    target: NDArray[np.int64]  # (K,) row of the target set
     decay: Tensor  # (K,) [1/s]
-    push_step: Tensor  # (K, P) control step before which it comes, -1 for none
+    push_step: Tensor  # (K, P) control step before which the push comes, -1 for none
     push_vel: Tensor  # (K, P, 2) [m/s]
 
 
-def shares(protocol: EvalProtocol, curriculum: float) -> Array:
-    """Shares (3,) of the strata when a part `curriculum` in [0, 1] of the ramp is done."""
+def stratum_probabilities(protocol: EvalProtocol, curriculum: float) -> Array:
+    """Compute the probabilities (3,) of the strata.
+
+    Args:
+        protocol: Protocol whose weights apply at the end of the curriculum.
+        curriculum: Completed fraction in [0, 1] of the curriculum.
+
+    Returns:
+        Probabilities of the strata in the order of STRATA.
+    """
     assert isinstance(protocol.targets, WorkspaceTargets)
     weights = protocol.targets.weights
     last = np.array([float(weights.get(name, 0)) for name in STRATA])
-    return FIRST_SHARES * (1 - curriculum) + last / last.sum() * curriculum
+    return INITIAL_STRATUM_PROBABILITIES * (1 - curriculum) + last / last.sum() * curriculum
 
 
-def weakened(protocol: EvalProtocol, severity: float) -> EvalProtocol:
-    """A protocol with a part of its noise, pushes and randomisation: none at 0, all at 1."""
-    if severity == 1.0:
+def scale_disturbances(protocol: EvalProtocol, scale: float) -> EvalProtocol:
+    """Scale the noise, the pushes and the randomization of a protocol.
+
+    Args:
+        protocol: Protocol to scale.
+        scale: Scale in [0, 1]: no disturbance and the nominal robot at 0, the protocol itself at 1.
+
+    Returns:
+        The scaled protocol.
+    """
+    if scale == 1.0:
         return protocol
 
-    def part(struct: Any, **neutral: float) -> Any:
-        """Every field on its way from what leaves the robot alone, 0 unless named."""
+    def scaled(struct: Any, **nominal: float) -> Any:
+        """Every field between its nominal value, 0 unless named, and the protocol's."""
         found = {}
         for name in struct.__struct_fields__:
-            value, still = np.array(getattr(struct, name)), neutral.get(name, 0.0)
-            found[name] = (still + severity * (value - still)).tolist()
+            value, still = np.array(getattr(struct, name)), nominal.get(name, 0.0)
+            found[name] = (still + scale * (value - still)).tolist()
         return msgspec.convert(found, type(struct))
 
     slide = load_robot(protocol.robot).facts.friction.slide
     return msgspec.structs.replace(
         protocol,
-        noise=part(protocol.noise),
-        push=msgspec.structs.replace(protocol.push, speed=severity * protocol.push.speed),
-        randomization=part(protocol.randomization, friction=slide, gain=1.0),
+        noise=scaled(protocol.noise),
+        push=msgspec.structs.replace(protocol.push, speed=scale * protocol.push.speed),
+        randomization=scaled(protocol.randomization, friction=slide, gain=1.0),
     )
 
 
-def draw_starts(
-    protocol: EvalProtocol, pool: TargetPool, count: int, rng: np.random.Generator, curriculum: float = 1.0
-) -> Draws:
-    """`count` episodes; the distributions are those of an evaluation's manifest (wbc_bench.randomization).
+def sample_episodes(
+    protocol: EvalProtocol,
+    target_set: TargetSet,
+    count: int,
+    rng: np.random.Generator,
+    curriculum: float = 1.0,
+) -> EpisodeSamples:
+    """Sample episodes with the distributions of an evaluation's manifest, on the host.
 
-    On the host.
+    Args:
+        protocol: Protocol of the episodes.
+        target_set: Targets that episodes pick from.
+        count: Number of episodes.
+        rng: Random generator.
+        curriculum: Completed fraction in [0, 1] of the curriculum over strata.
+
+    Returns:
+        Samples of `count` episodes.
     """
     spread = protocol.randomization
     leg_q = rng.uniform(-spread.leg_q, spread.leg_q, (count, NUM_LEG_JOINTS))
     velocity = np.repeat([spread.base_lin_vel, spread.base_ang_vel], 3)
-    push_step, push_vel = draw_pushes(protocol, count, rng)
+    push_step, push_vel = sample_pushes(protocol, count, rng)
     columns = dict(
         base_height=np.array([resting_height(protocol.robot, q) for q in leg_q]),
         friction=rng.uniform(*spread.friction, count),
@@ -82,24 +110,31 @@ def draw_starts(
         kp_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
         kd_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
     )
-    share, target = shares(protocol, curriculum), np.empty(count, dtype=np.int64)
-    stratum = rng.choice(len(STRATA), count, p=share)
+    probability, target = stratum_probabilities(protocol, curriculum), np.empty(count, dtype=np.int64)
+    stratum = rng.choice(len(STRATA), count, p=probability)
     within = rng.random(count)
     for k in range(len(STRATA)):
-        members = np.flatnonzero(pool.stratum == k)
+        members = np.flatnonzero(target_set.stratum == k)
         mine = stratum == k
         target[mine] = members[(within[mine] * len(members)).astype(np.int64)]
-    start = Start(**{name: torch.from_numpy(column) for name, column in columns.items()})
+    reset = ResetState(**{name: torch.from_numpy(column) for name, column in columns.items()})
     decay = rng.uniform(*DECAY, count)
-    return Draws(start, target, *map(torch.from_numpy, (decay, push_step, push_vel)))
+    return EpisodeSamples(reset, target, *map(torch.from_numpy, (decay, push_step, push_vel)))
 
 
-def draw_pushes(
+def sample_pushes(
     protocol: EvalProtocol, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """Steps (count, P) and jumps (count, P, 2) [m/s], as `randomization.draw_pushes`.
+    """Sample pushes as `wbc_bench.episodes.randomization` does, for many episodes.
 
-    P is MAX_PUSHES, or what fits into an episode where training asks for more.
+    Args:
+        protocol: Protocol of the episodes.
+        count: Number of episodes.
+        rng: Random generator.
+
+    Returns:
+        Control steps (count, P) before which a push comes, -1 for none, and velocity changes (count, P, 2)
+        [m/s]. P is MAX_PUSHES, or what fits into an episode where training pushes more often.
     """
     push: Push = protocol.push
     most = max(MAX_PUSHES, int(protocol.episodes.horizon / push.interval[0]))

@@ -1,6 +1,6 @@
-"""The reward, term by term: gated as the paper's, and additive with the same terms and scales.
+"""The terms of the reward: gated as in the paper, and additive with the same terms and scales.
 
-Every term is a pure function of what one control step has shown. Scales are per second, so a term counts
+Every term is a pure function of one control step. Scales are per second, so a term is multiplied by
 `scale * period`. Source: paper, section III-D, equations 6 to 12 and the table of reward terms; its silent
 constants from SPIRAL-EDWIN/JC_umi-on-tron @f83d62e unless a line says otherwise.
 """
@@ -55,7 +55,7 @@ BOUND = 5.0
 
 
 class Body(NamedTuple):
-    """What of the robot the reward needs."""
+    """The properties of the robot that the reward depends on."""
 
     lower: Tensor  # (14,) [rad]
     upper: Tensor  # (14,) [rad]
@@ -90,7 +90,7 @@ class Signals(NamedTuple):
 
 
 class Gates(NamedTuple):
-    """What multiplies a task term, each (N,) or a number."""
+    """The factors of the task terms, each (N,) or a number."""
 
     manipulation: Tensor | float  # (1 - g) s~_m: position and fine orientation
     reference: Tensor | float  # g s~_l
@@ -117,13 +117,23 @@ ADDITIVE = Gates(
 
 
 def mean_gate(d_start: Tensor, decay: Tensor, horizon: float, steps: int = 500) -> Tensor:
-    """Mean of g over an episode of `horizon` [s] whose reference starts at d_start (...,), decay [1/s]."""
+    """Compute the mean of the phase g over an episode.
+
+    Args:
+        d_start: (...) Task-progress reference at the start.
+        decay: (...) [1/s] Decay of the reference.
+        horizon: Length of the episode [s].
+        steps: Number of instants that are averaged.
+
+    Returns:
+        Means (...).
+    """
     time = torch.arange(1, steps + 1) * (horizon / steps)
     return gate((d_start[..., None] - decay[..., None] * time).clamp(min=0.0)).mean(-1)
 
 
 def safety_scores(signals: Signals, body: Body) -> tuple[Tensor, Tensor]:
-    """s_m and s_l (N,), in (0, 1]: how safe the motion is for manipulating and for walking.
+    """Compute the safety scores s_m of manipulation and s_l of locomotion, (N,) in (0, 1].
 
     Source: paper, eq. 7; quantities, tolerances and weights from SPIRAL-EDWIN/JC_umi-on-tron @f83d62e.
     """
@@ -147,7 +157,7 @@ def safety_scores(signals: Signals, body: Body) -> tuple[Tensor, Tensor]:
 
 
 def gates_of(phase: Tensor, s_m: Tensor, s_l: Tensor) -> Gates:
-    """The gates of the gated reward. Source: paper, eq. 7 and 10."""
+    """Compute the gates of the gated reward. Source: paper, eq. 7 and 10."""
     relaxed_l = s_l + OFFSET
     return Gates((1 - phase) * (s_m + OFFSET), phase * relaxed_l, relaxed_l * (0.25 + 0.75 * phase), phase)
 
@@ -155,11 +165,17 @@ def gates_of(phase: Tensor, s_m: Tensor, s_l: Tensor) -> Gates:
 def rewards(
     signals: Signals, body: Body, kind: Reward, period: float
 ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-    """The reward of one control step of `period` [s].
+    """Compute the reward of one control step.
+
+    Args:
+        signals: Quantities of N robots after the step.
+        body: Properties of the robot.
+        kind: Whether the task terms are gated, or weighted by the constants ADDITIVE.
+        period: Control period [s].
 
     Returns:
-        total (N,), bounded; the terms by name as they are summed, each (N,); the gates that the
-        gated reward has, for the log.
+        The total (N,), clipped to +-BOUND; the terms by name as they are summed, each (N,); and the gates of
+        the gated reward, for the log.
     """
     s = signals
     s_m, s_l = safety_scores(s, body)
@@ -193,7 +209,7 @@ def rewards(
 
 
 def progress(signals: Signals) -> Tensor:
-    """r_prog (N,): how far the errors fell below the best so far. Source: paper, eq. 8."""
+    """Compute r_prog (N,), the decrease of the errors below their best so far. Source: paper, eq. 8."""
     s = signals
     pos_gain = (s.best_pos_error - s.pos_error).clamp(min=0.0)
     rot_gain = (s.best_rot_error - s.rot_error).clamp(min=0.0)

@@ -1,4 +1,4 @@
-"""The folder of a run: settings, metrics, resume state, final checkpoint. Every write is whole or absent."""
+"""The folder of a training run: configuration, metrics, resume file, checkpoint. Every write is atomic."""
 
 import json
 import os
@@ -11,63 +11,70 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wbc_baselines.learned.training.config import Settings, TrainingError
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_bench.files import write_atomic
 
 if TYPE_CHECKING:
     from wbc_baselines.learned.training.trainer import Trainer
 
-CHECKPOINT_PERIOD = 90.0  # [s] between resume files: what a kill can cost
-STALE = 900.0  # [s] without a sign of life after which a claim may be taken over
+CHECKPOINT_PERIOD = 90.0  # [s] between resume files, the most that is lost when a run is killed
+STALE = 900.0  # [s] without an update after which a claim may be taken over
 
 
 @dataclass(frozen=True)
 class RunFolder:
-    """Files of one run under `path`."""
+    """The files of one run below `path`."""
 
     path: Path
 
     @property
-    def settings(self) -> Path:
-        return self.path / "settings.json"
+    def config(self) -> Path:
+        """Settings of the run, as JSON."""
+        return self.path / "config.json"
 
     @property
     def metrics(self) -> Path:
-        """One JSON object an iteration; a line after a resume replaces all from its iteration on."""
+        """One JSON object per iteration; a line written after a resume replaces all from its iteration on."""
         return self.path / "metrics.jsonl"
 
     @property
     def changes(self) -> Path:
-        """One JSON object a change: control steps so far, and each changed setting before and after."""
+        """One JSON object per change: control steps so far, and the old and new value of each setting."""
         return self.path / "changes.jsonl"
 
     @property
     def resume(self) -> Path:
+        """State from which an interrupted run continues."""
         return self.path / "resume.pt"
 
     @property
     def checkpoint(self) -> Path:
-        """What an evaluation reads, `learned:PATH`; as old as the resume file."""
+        """Checkpoint for an evaluation, `learned:PATH`, written together with the resume file."""
         return self.path / f"{self.path.name}.safetensors"
 
     @property
     def claim(self) -> Path:
+        """Host and process that trains the run."""
         return self.path / "claim"
 
     @property
     def finished(self) -> Path:
-        """Written last, when budget and final checkpoint are there."""
+        """Written last, when the budget is used up and the final checkpoint exists."""
         return self.path / "finished.json"
 
-    def open(self, settings: Settings, change: bool = False) -> None:
-        """Make the folder, or check that it belongs to these settings; with `change`, note what is new.
+    def open(self, config: TrainConfig, change: bool = False) -> None:
+        """Create the folder, or check that its run has the same settings.
+
+        Args:
+            config: Configuration of the run.
+            change: Whether other settings are accepted and recorded in `changes`.
 
         Raises:
-            TrainingError: it holds a run with other settings; they are listed.
+            TrainingError: The folder holds a run with other settings, which are listed.
         """
         self.path.mkdir(parents=True, exist_ok=True)
-        if self.settings.exists():
-            changed = settings.changes(json.loads(self.settings.read_text()))
+        if self.config.exists():
+            changed = config.changes(json.loads(self.config.read_text()))
             fixed = ("method", "seed", "protocol")  # what the run is called and judged by
             wrong = {n: c for n, c in changed.items() if not change or n in fixed}
             if wrong:
@@ -81,10 +88,10 @@ class RunFolder:
                 rows = self.read_metrics()
                 row = {"samples": rows[-1]["samples"] if rows else 0, "changed": changed}
                 _append(self.changes, row)
-        write_atomic(self.settings, json.dumps(asdict(settings), indent=2).encode())
+        write_atomic(self.config, json.dumps(asdict(config), indent=2).encode())
 
     def read_metrics(self) -> list[dict]:
-        """Metrics by iteration; a line that a kill has cut short is left out."""
+        """Read the metrics of all iterations; a line that was cut short by a kill is left out."""
         if not self.metrics.exists():
             return []
         rows: list[dict] = []
@@ -99,11 +106,11 @@ class RunFolder:
         return rows
 
     def append(self, row: dict) -> None:
-        """Add one iteration's metrics."""
+        """Append the metrics of one iteration."""
         _append(self.metrics, row)
 
     def take(self) -> bool:
-        """Claim the run for this process; False if another, living one has it."""
+        """Claim the run for this process; return False if another running process has claimed it."""
         self.path.mkdir(parents=True, exist_ok=True)
         try:
             with self.claim.open("x") as file:
@@ -127,21 +134,27 @@ class RunFolder:
         return self.take()
 
     def _is_dead(self) -> bool:
-        """Whether the claim is of a process of this machine that has ended."""
+        """Whether the claim belongs to a process of this machine that has ended."""
         host, _, pid = self.claim.read_text().partition(" ")
         return host == socket.gethostname() and pid.isdigit() and not Path(f"/proc/{pid}").exists()
 
     def touch(self) -> None:
-        """A sign of life."""
+        """Update the time of the claim, so that it is not taken over."""
         self.claim.touch()
 
     def release(self) -> None:
-        """Give the claim back."""
+        """Release the claim."""
         self.claim.unlink(missing_ok=True)
 
 
 def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
-    """Write checkpoint and resume file; `seconds` of training so far."""
+    """Write the checkpoint and the resume file.
+
+    Args:
+        trainer: Trainer to save.
+        folder: Folder of its run.
+        seconds: Training time so far [s].
+    """
     import io
 
     import torch
@@ -153,10 +166,17 @@ def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
 
 
 def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
-    """Continue from the resume file, if there is one; seconds of training before.
+    """Load the resume file, if there is one.
+
+    Args:
+        trainer: New trainer of the same run.
+        folder: Folder of the run.
+
+    Returns:
+        The training time so far [s].
 
     Raises:
-        TrainingError: the file cannot be read, or another version of the code wrote it.
+        TrainingError: The file cannot be read, or was written by another version of the code.
     """
     import pickle
     import zipfile
@@ -174,41 +194,47 @@ def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
     except (KeyError, TypeError) as error:  # a field too few or too many
         raise TrainingError(
             f"resume file '{folder.resume}' is of another version of the code ({error}); valid: the version "
-            "that wrote it, or another --out with --start at the run's checkpoint"
+            "that wrote it, or another --out with --init-checkpoint at the run's checkpoint"
         ) from error
     return saved["seconds"]
 
 
 def run(
-    settings: Settings,
+    config: TrainConfig,
     folder: RunFolder,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     tensorboard: bool = True,
     change: bool = False,
 ) -> None:
-    """Train from wherever the folder stands to the budget, and write the final checkpoint.
+    """Train up to the budget, from the folder's resume file if there is one, and write the final checkpoint.
 
-    With `change`, a run that was started with other settings goes on with these, in new episodes.
+    Args:
+        config: Configuration of the run.
+        folder: Folder of the run.
+        progress: Is called with completed and total control steps and a line of text.
+        tensorboard: Whether to write the metrics for TensorBoard as well.
+        change: Whether a run that was started with other settings is continued with these, in new episodes.
 
     Raises:
-        TrainingError: see `RunFolder.open`, `load_resume`, `Trainer.iterate`; or another process has the run.
+        TrainingError: See `RunFolder.open`, `load_resume` and `Trainer.iterate`; or another process is
+            training the run.
     """
     from wbc_baselines.learned.training.make import make_environment
     from wbc_baselines.learned.training.trainer import Trainer, duration
 
-    settings.check()
+    config.check()
     if not folder.take():
         raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
     try:
-        folder.open(settings, change)
-        trainer = Trainer(settings, make_environment(settings))
+        folder.open(config, change)
+        trainer = Trainer(config, make_environment(config))
         before = load_resume(trainer, folder)
         if not trainer.done:
             folder.finished.unlink(missing_ok=True)  # at a smaller budget
         started, first = time.monotonic() - before, trainer.samples
         saved = time.monotonic()
         writer = _writer(folder, trainer.iteration) if tensorboard else None
-        per_iteration = settings.envs * settings.steps
+        per_iteration = config.num_envs * config.num_steps_per_env
         with _stop_requests() as stop:
             while not trainer.done:
                 metrics = trainer.iterate()
@@ -219,7 +245,7 @@ def run(
                 if writer:
                     for name, value in metrics.items():
                         writer.add_scalar(name, value, trainer.samples)
-                progress(trainer.samples - first, int(settings.budget) - first, line(trainer, metrics, rate))
+                progress(trainer.samples - first, int(config.budget) - first, line(trainer, metrics, rate))
                 if stop or trainer.done or time.monotonic() - saved > CHECKPOINT_PERIOD:
                     save_resume(trainer, folder, seconds)
                     saved = time.monotonic()
@@ -236,7 +262,7 @@ def run(
 
 @contextmanager
 def _stop_requests() -> Iterator[list[int]]:
-    """A list that fills when the process is asked to stop, so that it can save; a second ask is obeyed."""
+    """A list that fills when a signal asks the process to stop; a second signal interrupts it at once."""
     asked: list[int] = []
 
     def note(number: int, _: object) -> None:
@@ -253,10 +279,10 @@ def _stop_requests() -> Iterator[list[int]]:
 
 
 def line(trainer: "Trainer", metrics: dict[str, float], rate: float) -> str:
-    """How training stands, for a progress line."""
+    """Describe the state of training in one line of text."""
     share = {name: metrics[f"episode/{name}"] for name in ("success", "falls")}
     return (
-        f"{trainer.settings.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
+        f"{trainer.config.name}, iteration {trainer.iteration}, {rate:.0f} control steps/s, "
         f"return {metrics['episode/return']:.1f}, success {share['success']:.1%}, falls {share['falls']:.1%}"
     )
 

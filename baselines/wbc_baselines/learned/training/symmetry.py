@@ -29,7 +29,7 @@ class Mirror(NamedTuple):
 
 
 def joint_mirror(robot: Robot) -> Mirror:
-    """Of joint angles, velocities and actions (..., 14), by the joints' axes."""
+    """Return the mirror of joint angles, velocities and actions (..., 14), derived from the joint axes."""
     model = robot.model()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)  # at joint angles of zero
@@ -42,7 +42,7 @@ def joint_mirror(robot: Robot) -> Mirror:
 
 
 def input_mirror(robot: Robot) -> Mirror:
-    """Of what a policy without context sees, observation and command (..., 67)."""
+    """Return the mirror of the inputs of a policy without a context, observation and command (..., 67)."""
     joints, pose = joint_mirror(robot), (POLAR, POLAR, AXIAL)  # position, first and second column
     mirror = _side_by_side(AXIAL, POLAR, joints, joints, joints, *pose, SAME, *pose)
     assert len(mirror.place) == width(OBSERVATION_LAYOUT) + width(COMMAND_LAYOUT)
@@ -50,7 +50,7 @@ def input_mirror(robot: Robot) -> Mirror:
 
 
 def privileged_mirror(robot: Robot) -> Mirror:
-    """Of what only a simulation knows, (..., 80); what stands in the world frame, about its plane y = 0."""
+    """Return the mirror of the privileged vector (..., 80); world-frame entries about the plane y = 0."""
     joints = joint_mirror(robot)
     factors = Mirror(joints.place, np.ones_like(joints.sign))
     feet = Mirror(np.roll(np.arange(6), 3), np.array(2 * POLAR, np.float32))
@@ -63,7 +63,7 @@ def privileged_mirror(robot: Robot) -> Mirror:
 
 
 def critic_mirror(robot: Robot) -> Mirror:
-    """Of what the critic sees without a context, (..., 147)."""
+    """Return the mirror of the critic's inputs without a context (..., 147)."""
     return _side_by_side(input_mirror(robot), privileged_mirror(robot))
 
 

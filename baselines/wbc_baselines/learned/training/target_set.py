@@ -1,8 +1,8 @@
-"""The targets that training draws from: feasible ones of the evaluation's own generator, made once and kept.
+"""The targets of training: feasible ones from the evaluation's own generator, generated once and stored.
 
-A target takes some 40 ms to find (a `step` target 100 ms), a training run needs one every few hundred
-microseconds. So a pool is drawn once, from streams of which no evaluation shares a key, and episodes pick
-from it.
+Finding a target takes about 40 ms (100 ms in the stratum `step`), while a training run needs one every few
+hundred microseconds. A set is therefore generated once, from random streams that no evaluation shares, and
+episodes pick from it.
 """
 
 import hashlib
@@ -22,38 +22,49 @@ from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.outcomes import STRATA
 
-SEED_OFFSET = 2**62  # added to the protocol's seed: no evaluation draws from such a key
-POOLS = Path(__file__).parents[1] / "pools"  # ships with the package
-CHUNK = 30  # targets a task: about a second of work
+SEED_OFFSET = 2**62  # added to the protocol's seed, so that no evaluation uses the same random stream
+TARGET_SETS = Path(__file__).parents[1] / "target_sets"  # ships with the package
+CHUNK = 30  # targets per task, about a second of work
 
 Progress = Callable[[int, int], None]  # (done, total)
 
 
-class TargetPool(NamedTuple):
+class TargetSet(NamedTuple):
     """M feasible targets."""
 
     stratum: NDArray[np.int8]  # (M,) index into STRATA
     pos_w: NDArray[np.float32]  # (M, 3) [m]
     quat_w: NDArray[np.float32]  # (M, 4) wxyz
-    witness_qpos: NDArray[np.float32]  # (M, 21) a posture that reaches it: base [m], wxyz, joints [rad]
+    witness_qpos: NDArray[
+        np.float32
+    ]  # (M, 21) feasible posture that reaches the target: base [m], wxyz, joints [rad]
 
     def __len__(self) -> int:
         return len(self.stratum)
 
 
 def digest(protocol: EvalProtocol) -> str:
-    """SHA-256 of what of a protocol a target depends on: the box, the robot, the limits, the seed."""
+    """Return the SHA-256 of the parts of a protocol that targets depend on: ranges, robot, limits, seed."""
     parts = [protocol.targets, protocol.robot, protocol.termination, protocol.episodes.seed]
     return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()
 
 
-def draw_pool(
+def draw_target_set(
     protocol: EvalProtocol, count: int, workers: int = 1, progress: Progress = lambda done, total: None
-) -> TargetPool:
-    """`count` targets, the strata in turn; the same for any number of workers.
+) -> TargetSet:
+    """Generate feasible targets, alternating between the strata.
+
+    Args:
+        protocol: Protocol whose targets are generated.
+        count: Number of targets.
+        workers: Number of processes; the result does not depend on it.
+        progress: Is called with completed and total targets.
+
+    Returns:
+        A set of `count` targets.
 
     Raises:
-        ProtocolError: the protocol has no workspace targets, or a stratum cannot be filled.
+        ProtocolError: The protocol has no workspace targets, or a stratum cannot be filled.
     """
     if not isinstance(protocol.targets, WorkspaceTargets):
         raise ProtocolError(f"protocol {protocol.name}: targets of type reach, valid for training: workspace")
@@ -74,15 +85,21 @@ def draw_pool(
         rows.extend(part)
         progress(len(rows), count)
     stratum, *poses = zip(*rows, strict=True)
-    return TargetPool(np.array(stratum, np.int8), *(np.array(pose, np.float32) for pose in poses))
+    return TargetSet(np.array(stratum, np.int8), *(np.array(pose, np.float32) for pose in poses))
 
 
-def write_pool(pool: TargetPool, protocol: EvalProtocol, path: Path) -> None:
-    """Write a pool with the digest of what it was drawn for, at once or not at all."""
-    columns = [pa.array(pool.stratum)]
-    for values in pool[1:]:
+def write_target_set(target_set: TargetSet, protocol: EvalProtocol, path: Path) -> None:
+    """Write a target set with the digest of its protocol, atomically.
+
+    Args:
+        target_set: Targets to write.
+        protocol: Protocol they were generated for.
+        path: Parquet file.
+    """
+    columns = [pa.array(target_set.stratum)]
+    for values in target_set[1:]:
         columns.append(pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1]))
-    table = pa.Table.from_arrays(columns, names=list(TargetPool._fields))
+    table = pa.Table.from_arrays(columns, names=list(TargetSet._fields))
     table = table.replace_schema_metadata({"protocol": protocol.name, "digest": digest(protocol)})
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_name(f".{path.name}.part")
@@ -90,31 +107,38 @@ def write_pool(pool: TargetPool, protocol: EvalProtocol, path: Path) -> None:
     fresh.replace(path)
 
 
-def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
-    """The pool of a protocol, by default the one that ships.
+def read_target_set(protocol: EvalProtocol, path: Path | None = None) -> TargetSet:
+    """Read the target set of a protocol.
+
+    Args:
+        protocol: Protocol of the training.
+        path: Parquet file; None for the set that ships with the package.
+
+    Returns:
+        The targets.
 
     Raises:
-        ManifestError: missing, unreadable, or drawn for other targets, another robot or other limits.
+        ManifestError: The file is missing, unreadable, or was generated for other targets, another robot or
+            other limits.
     """
-    path = path or POOLS / f"{protocol.name}.parquet"
+    path = path or TARGET_SETS / f"{protocol.name}.parquet"
     if not path.exists():
         raise ManifestError(
-            f"target pool '{path}' does not exist: make it with "
-            f"`wbc-train targets --protocol {protocol.name}`"
+            f"target set '{path}' does not exist: make it with `wbc-train targets --protocol {protocol.name}`"
         )
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
-        raise ManifestError(f"target pool '{path}' is not readable parquet: {error}") from error
+        raise ManifestError(f"target set '{path}' is not readable parquet: {error}") from error
     made_for = (table.schema.metadata or {}).get(b"digest", b"").decode()
-    if table.column_names != list(TargetPool._fields):
+    if table.column_names != list(TargetSet._fields):
         raise ManifestError(
-            f"target pool '{path}' has columns {', '.join(table.column_names)}, valid: "
-            f"{', '.join(TargetPool._fields)}: draw it again with `wbc-train targets`"
+            f"target set '{path}' has columns {', '.join(table.column_names)}, valid: "
+            f"{', '.join(TargetSet._fields)}: draw it again with `wbc-train targets`"
         )
     if made_for != digest(protocol):
         raise ManifestError(
-            f"target pool '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
+            f"target set '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
             f"{protocol.name} has {digest(protocol)[:16]}...: draw it again with `wbc-train targets`"
         )
 
@@ -122,4 +146,4 @@ def read_pool(protocol: EvalProtocol, path: Path | None = None) -> TargetPool:
         column = table[name].combine_chunks()
         return column.flatten().to_numpy().reshape(len(table), -1)
 
-    return TargetPool(table["stratum"].to_numpy(), *map(matrix, TargetPool._fields[1:]))
+    return TargetSet(table["stratum"].to_numpy(), *map(matrix, TargetSet._fields[1:]))

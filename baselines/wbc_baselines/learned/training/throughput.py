@@ -1,4 +1,4 @@
-"""What training and evaluation take beside the physics that they need, measured side by side in one run."""
+"""The speed of training and evaluation relative to the physics alone, measured together in one process."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -10,28 +10,28 @@ from typing import NamedTuple
 import mujoco.batch
 
 from wbc_baselines.learned.policy import checkpoint
-from wbc_baselines.learned.training.config import Settings
+from wbc_baselines.learned.training.config import TrainConfig
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.evaluation import simulation
 from wbc_bench.evaluation.shard import evaluate_shard
 
-ROUNDS = 5  # the first is warm-up; methods take turns, so that all meet the same machine
-EPISODES = 50  # of an evaluation, as many as in a shard
+ROUNDS = 5  # the first is a warm-up; methods alternate, so that all run under the same load
+EPISODES = 50  # per evaluation, as many as in a shard
 
 
 class Speed(NamedTuple):
-    """One method on this machine: medians over the rounds."""
+    """The speed of one method on this machine, as medians over the rounds."""
 
     method: str
     steps: float  # control steps/s of training
     physics: float  # control steps/s of the engine alone, in the same states
-    training: float  # the engine's share of training's time: the first over the second
-    evaluation: float | None  # the engine's share of an evaluation's time, one thread; None without a policy
+    training: float  # fraction of the training time spent in the engine, steps / physics
+    evaluation: float | None  # the same for an evaluation on one thread; None without a checkpoint
 
 
 class EngineClock(mujoco.batch.Batch):
-    """MuJoCo's batch of simulations, which counts the time that its steps take."""
+    """MuJoCo's batch of simulations, with a counter of the time [s] spent in its steps."""
 
     seconds = 0.0
 
@@ -43,11 +43,20 @@ class EngineClock(mujoco.batch.Batch):
 
 
 def measure(
-    settings: Settings, methods: Sequence[str], rounds: int = ROUNDS, episodes: int = EPISODES
+    config: TrainConfig, methods: Sequence[str], rounds: int = ROUNDS, episodes: int = EPISODES
 ) -> list[Speed]:
-    """Train and evaluate the methods in turns, each from its policy that ships, or else from the oracle's.
+    """Train and evaluate methods in turns, each from its committed checkpoint or else from the oracle's.
 
-    Training is PPO without a teacher; lessons of geometry are in if they begin at 0 control steps.
+    Training is PPO without a teacher; the arm-IK and posture losses are active if their intervals begin at 0.
+
+    Args:
+        config: Settings that all methods share.
+        methods: Methods to measure.
+        rounds: Number of rounds, of which the first is discarded.
+        episodes: Number of episodes per evaluation.
+
+    Returns:
+        The speed of each method.
     """
     import torch
 
@@ -55,27 +64,27 @@ def measure(
     from wbc_baselines.learned.training.trainer import Trainer, duration
 
     available = checkpoint.available()
-    ours = {m: name for m in methods if (name := f"{m}@{settings.seed}") in available}
-    protocol, path = find_protocol(settings.protocol)
+    ours = {m: name for m in methods if (name := f"{m}@{config.seed}") in available}
+    protocol, path = find_protocol(config.protocol)
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, episodes)
-    control_steps = settings.envs * settings.steps
+    control_steps = config.num_envs * config.num_steps_per_env
     training: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}
     evaluation: dict[str, list[float]] = {method: [] for method in methods}
     with _engine_clocks():
         trainers = []
         for method in methods:
-            chosen = replace(settings, method=method, start=ours.get(method, "oracle@0"), teacher="")
+            chosen = replace(config, method=method, init_checkpoint=ours.get(method, "oracle@0"), teacher="")
             trainers.append(Trainer(chosen, make_environment(chosen)))
         for _ in range(rounds):
             for trainer in trainers:
                 before = EngineClock.seconds
                 whole = duration(trainer.iterate())
-                training[trainer.settings.method].append((whole, EngineClock.seconds - before))
+                training[trainer.config.method].append((whole, EngineClock.seconds - before))
         torch.set_num_threads(1)
         for _ in range(rounds):
             for method, name in ours.items():
                 evaluation[method].append(_evaluation(f"learned:{name}", protocol, rows))
-        torch.set_num_threads(settings.threads)
+        torch.set_num_threads(config.threads)
     return [
         Speed(
             method,
@@ -89,7 +98,7 @@ def measure(
 
 
 def _evaluation(spec: str, protocol: EvalProtocol, rows: EpisodeManifest) -> float:
-    """The engine's share of the time that these episodes take, as one shard."""
+    """The fraction of the time of these episodes, as one shard, that is spent in the engine."""
     begun, before = time.perf_counter(), EngineClock.seconds
     evaluate_shard(spec, protocol, rows)
     return (EngineClock.seconds - before) / (time.perf_counter() - begun)
@@ -97,7 +106,7 @@ def _evaluation(spec: str, protocol: EvalProtocol, rows: EpisodeManifest) -> flo
 
 @contextmanager
 def _engine_clocks() -> Iterator[None]:
-    """Have simulations of training and evaluation made from here on count their engine's time."""
+    """Let simulations of training and evaluation that are created from here on count their engine's time."""
     from wbc_baselines.learned.training.backends import cpu
 
     places = (cpu, simulation)

@@ -1,4 +1,4 @@
-"""A policy begins with the weights of another one."""
+"""Initialization of a policy with the weights of a checkpoint."""
 
 import torch
 
@@ -8,20 +8,23 @@ from wbc_baselines.learned.policy.networks import Actor
 INPUTS = OBSERVATION + COMMAND
 
 
-def begin_with(actor: torch.nn.Module, start: Actor, context: int, samples: int) -> None:
-    """Give rsl-rl's actor the weights of a start.
+def warm_start(actor: torch.nn.Module, init: Actor, context: int, count: int) -> None:
+    """Copy weights and normalizer statistics of a checkpoint into rsl-rl's actor.
 
-    context: how many columns of context they share. Others of the start stay at their mean, others of the
-        actor begin without effect.
-    samples: how many observations the start's normaliser counts for, before it follows training's own.
+    Args:
+        actor: Actor of rsl-rl that is to be initialized.
+        init: Policy of the checkpoint.
+        context: Number of context columns that both policies share. Further columns of the checkpoint are
+            held at their mean, further columns of the actor begin with weights of zero.
+        count: Number of observations that the copied statistics count for in the running averages.
     """
-    weights, mine = start.mlp.state_dict(), actor.mlp.state_dict()  # type: ignore[union-attr]
+    weights, mine = init.mlp.state_dict(), actor.mlp.state_dict()  # type: ignore[union-attr]
     columns = INPUTS + context
     first = torch.zeros_like(mine["0.weight"])
     first[:, :columns] = weights["0.weight"][:, :columns]
     actor.mlp.load_state_dict(weights | {"0.weight": first})  # type: ignore[union-attr]
-    normalizer, mean, std = actor.obs_normalizer, start.normalizer.mean, start.normalizer.std
+    normalizer, mean, std = actor.obs_normalizer, init.normalizer.mean, init.normalizer.std
     normalizer._mean[0, :columns] = mean[:columns]  # type: ignore[index]
     normalizer._var[0, :columns] = std[:columns].square()  # type: ignore[index]
     normalizer._std[0, :columns] = std[:columns]  # type: ignore[index]
-    normalizer.count.fill_(samples)  # type: ignore[union-attr]
+    normalizer.count.fill_(count)  # type: ignore[union-attr]

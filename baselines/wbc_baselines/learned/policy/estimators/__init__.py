@@ -22,7 +22,17 @@ ESTIMATORS: dict[str, type[Estimator]] = {
 
 
 def make_estimator(name: str) -> Estimator:
-    """A fresh estimator; its weights come from torch's global generator. Raises: UnknownNameError."""
+    """Create an estimator with random weights from torch's global generator.
+
+    Args:
+        name: Name of an estimator.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        UnknownNameError: There is no such estimator.
+    """
     if name not in ESTIMATORS:
         raise UnknownNameError("estimator", name, ESTIMATORS, "make_estimator")
     return ESTIMATORS[name]()

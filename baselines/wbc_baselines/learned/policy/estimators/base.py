@@ -1,4 +1,4 @@
-"""What every context estimator offers, and the rollout it learns from."""
+"""The interface of context estimators, and the rollout that they are trained on."""
 
 from typing import ClassVar, NamedTuple
 
@@ -17,10 +17,10 @@ class Batch(NamedTuple):
 
 
 class Estimator(nn.Module):
-    """A map from the window of observations, and maybe a recurrent state, to the actor's context.
+    """A function from the window of observations, and possibly a recurrent state, to the actor's context.
 
-    `context_dim` columns of context, `state_dim` of recurrent state, `latent_dim` of noise for a sampled
-    latent; `trainable` says whether `losses` exists.
+    `context_dim`, `state_dim` and `latent_dim` are the columns of the context, of the recurrent state and of
+    the noise for a sampled latent; `trainable` states whether `losses` exists.
     """
 
     context_dim: ClassVar[int] = 0
@@ -29,15 +29,29 @@ class Estimator(nn.Module):
     trainable: ClassVar[bool] = False
 
     def step(self, history: Tensor, state: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Context (N, context_dim) and next state (N, S) of windows (N, HISTORY, 57) and states (N, S).
+        """Compute the context of one control step.
 
-        noise (N, latent_dim), standard normal, samples the latent; without it the latent is its mean.
+        Args:
+            history: (N, HISTORY, 57) Windows.
+            state: (N, S) Recurrent states.
+            noise: (N, latent_dim) Standard normal noise that samples the latent; None for its mean.
+
+        Returns:
+            Context (N, context_dim) and next recurrent state (N, S).
         """
         raise NotImplementedError
 
     def losses(self, batch: Batch, noise: Tensor) -> dict[str, Tensor]:
-        """Scalars by name; `total` is what is minimised. noise (T, N, latent_dim), standard normal."""
+        """Compute the losses of a rollout.
+
+        Args:
+            batch: Whole sequences.
+            noise: (T, N, latent_dim) Standard normal noise that samples the latent.
+
+        Returns:
+            Scalars by name, of which `total` is minimized.
+        """
         raise NotImplementedError
 
     def observe(self, history: Tensor) -> None:
-        """Take the newest terms of windows (..., HISTORY, 57) into the input normaliser, in training."""
+        """Update the input normalizer with the newest frames of windows (..., HISTORY, 57)."""

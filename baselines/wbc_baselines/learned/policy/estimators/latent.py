@@ -1,4 +1,4 @@
-"""What the estimators with a latent share: its distribution, the losses, one step and a whole rollout."""
+"""The common part of estimators with a latent: its distribution, the losses, single steps and rollouts."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from wbc_baselines.learned.policy.estimators.base import Batch, Estimator
 from wbc_baselines.learned.policy.estimators.memory import Memory
-from wbc_baselines.learned.policy.inputs import HISTORY_TERM, VELOCITY
+from wbc_baselines.learned.policy.inputs import HISTORY_FRAME, VELOCITY
 from wbc_baselines.learned.policy.normalizer import Normalizer
 
 VARIANCE_FLOOR = 1e-4  # Source: paper, eq. estimated_context
@@ -16,7 +16,7 @@ KL_WEIGHT = 0.1  # beta. Source: paper, section III-C
 
 
 def split(e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocity (..., 3) [m/s], mean (..., L) and variance (..., L) of the latent, of e (..., 3 + 2 L).
+    """Split e (..., 3 + 2 L) into velocity (..., 3) [m/s], and mean and variance (..., L) of the latent.
 
     Source: paper, eq. context_partition and eq. estimated_context.
     """
@@ -26,18 +26,21 @@ def split(e: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def kl_to_standard(mean: Tensor, variance: Tensor) -> Tensor:
-    """KL divergence (..., L) of N(mean, variance) from N(0, 1). Source: Kingma and Welling 2014, app. B."""
+    """Compute the KL divergence (..., L) of N(mean, variance) from N(0, 1).
+
+    Source: Kingma and Welling 2014, app. B.
+    """
     return 0.5 * (variance + mean.square() - 1.0 - variance.log())
 
 
 def masked_mean(values: Tensor, valid: Tensor) -> Tensor:
-    """Mean over the samples (T, N) where `valid`, and over features, of values (T, N, F); 0 without one."""
+    """Average values (T, N, F) over features and over the valid samples (T, N); 0 if there are none."""
     kept = torch.where(valid[..., None], values, 0.0).sum()
     return kept / (valid.sum().clamp(min=1) * values.shape[-1])
 
 
 def mlp(*sizes: int) -> nn.Sequential:
-    """Linear layers of these sizes with ELU in between."""
+    """Create linear layers of these sizes with ELU in between."""
     layers: list[nn.Module] = []
     for k, (inputs, outputs) in enumerate(pairwise(sizes)):
         layers += [nn.ELU()] * (k > 0) + [nn.Linear(inputs, outputs)]
@@ -45,12 +48,12 @@ def mlp(*sizes: int) -> nn.Sequential:
 
 
 class LatentEstimator(Estimator):
-    """Encoder -> maybe a memory -> e = (velocity, mean, log variance) -> context (velocity, latent).
+    """Encoder -> optional memory -> e = (velocity, mean, log variance) -> context (velocity, latent).
 
-    The encoder sees normalised windows. Losses are means over features, as in the lineage of the paper
+    The encoder receives normalised windows. Losses are means over features, as in the lineage of the paper
     (SPIRAL-EDWIN/JC_umi-on-tron @f83d62e, ppo_ios.py): the velocity, the next observation and the KL
-    divergence then weigh alike whatever their number of columns. Only the prediction is masked by `valid`:
-    velocity and latent of an episode's last step are as good as any.
+    divergence then have equal weights whatever their number of columns. Only the prediction is masked by
+    `valid`, because velocity and latent of an episode's last step are valid targets.
     """
 
     trainable = True
@@ -59,7 +62,7 @@ class LatentEstimator(Estimator):
 
     def __init__(self, encoder: nn.Module, memory: Memory | None, decoder: nn.Module) -> None:
         super().__init__()
-        self.normalizer = Normalizer(HISTORY_TERM)
+        self.normalizer = Normalizer(HISTORY_FRAME)
         self.encoder, self.memory, self.decoder = encoder, memory, decoder
 
     def step(self, history: Tensor, state: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -72,13 +75,16 @@ class LatentEstimator(Estimator):
         return torch.cat([velocity, latent], dim=-1), state
 
     def encode(self, batch: Batch) -> Tensor:
-        """e (T, N, 3 + 2 L) of a whole rollout; what `step` gives one control step at a time."""
+        """Compute e (T, N, 3 + 2 L) of a whole rollout, equal to what `step` computes step by step."""
         steps, count = batch.start.shape
         e = self.encoder(self.normalizer(batch.history.flatten(0, 1))).unflatten(0, (steps, count))
         return e if self.memory is None else self.memory.unroll(e, batch.state, batch.start)
 
     def losses(self, batch: Batch, noise: Tensor) -> dict[str, Tensor]:
-        """`velocity`, `prediction`, `kl` and their weighted `total`. Source: paper, eq. estimator_loss."""
+        """Compute `velocity`, `prediction`, `kl` and their weighted `total`.
+
+        Source: paper, eq. estimator_loss.
+        """
         velocity, mean, variance = split(self.encode(batch))
         latent = mean + variance.sqrt() * noise
         code = torch.cat([velocity, latent], dim=-1) if self.decode_velocity else latent
@@ -90,5 +96,5 @@ class LatentEstimator(Estimator):
         return losses | {"total": losses["velocity"] + losses["prediction"] + KL_WEIGHT * losses["kl"]}
 
     def observe(self, history: Tensor) -> None:
-        """Take the newest terms of windows (..., HISTORY, 57) into the input normaliser."""
+        """Update the input normalizer with the newest frames of windows (..., HISTORY, 57)."""
         self.normalizer.update(history[..., -1, :])

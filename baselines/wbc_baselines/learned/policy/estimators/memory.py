@@ -1,4 +1,4 @@
-"""Memory across windows: a GRU whose output corrects the features that went into it."""
+"""Memory across windows: a GRU whose output is added to its input features."""
 
 import torch
 from torch import Tensor, nn
@@ -13,12 +13,12 @@ class Memory(nn.Module):
         self.out = nn.Linear(size, size)
 
     def forward(self, u: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """e (N, F) and the next state (N, F) of features u (N, F)."""
+        """Compute e (N, F) and the next state (N, F) of features u (N, F)."""
         state = self.cell(u, state)  # of a GRU the output is the state
         return u + self.out(state), state
 
     def unroll(self, u: Tensor, state: Tensor, start: Tensor) -> Tensor:
-        """e (T, N, F) of features u (T, N, F); the state (N, F) is zeroed where start (T, N)."""
+        """Compute e (T, N, F) of features u (T, N, F); the state (N, F) is zeroed where start (T, N)."""
         keep = (~start).to(u.dtype)[..., None]
         states = []
         for features, kept in zip(u.unbind(), keep.unbind(), strict=True):

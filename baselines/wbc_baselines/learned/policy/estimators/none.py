@@ -1,4 +1,4 @@
-"""No context: the actor sees the present observation and the command alone."""
+"""No context: the actor receives the current observation and the command only."""
 
 from torch import Tensor
 

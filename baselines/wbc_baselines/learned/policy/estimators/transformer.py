@@ -1,4 +1,4 @@
-"""Transformer only: each window is encoded on its own, nothing is remembered."""
+"""Transformer only: each window is encoded independently, without memory."""
 
 from wbc_baselines.learned.policy.estimators.latent import LatentEstimator, mlp
 from wbc_baselines.learned.policy.estimators.window import WindowEncoder

@@ -1,4 +1,4 @@
-"""The Transformer over one window of observations, of which only the last token is read out."""
+"""The Transformer over one window of observations, of which only the last token is used."""
 
 import math
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from wbc_baselines.learned.policy.inputs import HISTORY, HISTORY_TERM
+from wbc_baselines.learned.policy.inputs import HISTORY, HISTORY_FRAME
 
 # Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e; no dropout
 MODEL, LAYERS, HEADS, FEED_FORWARD = 128, 2, 8, 512
@@ -14,7 +14,7 @@ HEAD = MODEL // HEADS
 
 
 def sinusoids(length: int, size: int) -> Tensor:
-    """Positional encodings (length, size). Source: Vaswani et al. 2017, section 3.5."""
+    """Compute positional encodings (length, size). Source: Vaswani et al. 2017, section 3.5."""
     angle = torch.arange(length)[:, None] * torch.exp(torch.arange(0, size, 2) * (-math.log(1e4) / size))
     return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(1)
 
@@ -42,14 +42,14 @@ class Layer(nn.Module):
         return self.norm2(x + self.narrow(self.widen(x).relu_()))
 
     def _attend(self, x: Tensor) -> Tensor:
-        """What every token gathers from all, (N, T, MODEL)."""
+        """Attention of every token to all tokens, (N, T, MODEL)."""
         query, key, value = (
             part.unflatten(-1, (HEADS, HEAD)).transpose(1, 2) for part in self.qkv(x).chunk(3, -1)
         )
         return functional.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
 
     def _attend_last(self, x: Tensor) -> Tensor:
-        """What the last token gathers from all, (N, 1, MODEL).
+        """Attention of the last token to all tokens, (N, 1, MODEL).
 
         Keys and values of the tokens are not formed: q . (K x) = (K^T q) . x, and the mean of V x is V times
         the mean of x. That is a sixth of the work. The bias of the keys moves all scores alike and drops out.
@@ -72,7 +72,7 @@ class WindowEncoder(nn.Module):
 
     def __init__(self, size: int) -> None:
         super().__init__()
-        self.embed = nn.Linear(HISTORY_TERM, MODEL)
+        self.embed = nn.Linear(HISTORY_FRAME, MODEL)
         self.register_buffer("positions", sinusoids(HISTORY, MODEL), persistent=False)
         self.layers = nn.ModuleList(Layer() for _ in range(LAYERS))
         self.read_out = nn.Linear(MODEL, size)

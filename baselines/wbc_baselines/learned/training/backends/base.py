@@ -1,4 +1,4 @@
-"""What the training environment asks of its physics."""
+"""The interface between the training environment and a physics engine."""
 
 from typing import NamedTuple, Protocol
 
@@ -11,8 +11,8 @@ from wbc_bench.evaluation.simulation import Places
 MAX_SPEED = 60.0  # [m/s, rad/s] of any coordinate; beyond it a simulation of 10 ms steps counts as diverged
 
 
-class Start(NamedTuple):
-    """How K episodes start: columns as those of an evaluation's manifest, float64."""
+class ResetState(NamedTuple):
+    """The random initial conditions and parameters of K episodes, named as in a manifest, float64."""
 
     base_height: Tensor  # (K,) [m]
     friction: Tensor  # (K,)
@@ -25,7 +25,7 @@ class Start(NamedTuple):
 
 
 class State(NamedTuple):
-    """The true state of N simulations after a control step, float32, fresh tensors."""
+    """The true state of N simulations after a control step, float32, in tensors of its own."""
 
     qpos: Tensor  # (N, 21) position [m], wxyz, joints [rad]
     qvel: Tensor  # (N, 20) linear in the world [m/s], angular in the base [rad/s], joints [rad/s]
@@ -44,7 +44,7 @@ class State(NamedTuple):
             mine[ids] = theirs
 
     def where_sound(self, before: "State") -> "State":
-        """This state, but the one before where a simulation has diverged: no sum meets a NaN."""
+        """Replace the rows of diverged simulations by those of the state before, so that sums stay finite."""
         rows = []
         for now, then in zip(self, before, strict=True):
             lost = self.diverged.reshape(-1, *[1] * (now.ndim - 1))
@@ -53,7 +53,7 @@ class State(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """`Places` on the device of the arrays: an index from the host would stop a GPU at every use."""
+    """`Places` on the device of the arrays, because an index from the host would synchronize a GPU."""
 
     tcp: int  # site
     soles: Tensor  # (2,) sites
@@ -62,7 +62,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(places: Places, device: torch.device) -> Columns:
-    """See `Columns`."""
+    """Move `Places` to a device, see `Columns`."""
     indices = (places.soles, places.sole_force.ravel(), places.ground)
     return Columns(places.tcp, *(torch.as_tensor(index, device=device) for index in indices))
 
@@ -70,7 +70,20 @@ def columns_of(places: Places, device: torch.device) -> Columns:
 def state_of(
     columns: Columns, qpos: Tensor, qvel: Tensor, torque: Tensor, pos: Tensor, rot: Tensor, sensor: Tensor
 ) -> State:
-    """The state in arrays of an engine: sites' `pos` (N, S, 3) and `rot` (N, S, 3, 3), `sensor` (N, C)."""
+    """Assemble the state from the arrays of an engine.
+
+    Args:
+        columns: Indices into the arrays.
+        qpos: (N, 21) Positions.
+        qvel: (N, 20) Velocities.
+        torque: (N, 14) [N m] Joint torques.
+        pos: (N, S, 3) [m] Positions of the sites.
+        rot: (N, S, 3, 3) Rotations of the sites.
+        sensor: (N, C) Values of the sensors.
+
+    Returns:
+        The state of N simulations.
+    """
     tcp, soles, force, ground = columns
     return State(
         qpos=qpos,
@@ -87,31 +100,31 @@ def state_of(
 
 
 class Backend(Protocol):
-    """N simulations of the robot of one protocol."""
+    """N parallel simulations of the robot of one protocol."""
 
     num_envs: int
     device: torch.device
 
-    def reset(self, ids: Tensor, start: Start) -> State:
-        """Start the simulations `ids` (K,) anew; their state, K rows."""
+    def reset(self, ids: Tensor, reset: ResetState) -> State:
+        """Reset the simulations `ids` (K,) and return their state, K rows."""
         ...
 
     def push(self, velocity_w: Tensor) -> None:
-        """Add (N, 2) [m/s] to the base's horizontal velocity, zero for no push."""
+        """Add velocities (N, 2) [m/s] to the horizontal velocity of the base; 0 for no push."""
         ...
 
     def step(self, command: Tensor) -> State:
-        """Track joint commands (N, 14) [rad] for one control period."""
+        """Track joint commands (N, 14) [rad] for one control period and return the new state."""
         ...
 
     def check(self) -> None:
-        """Raise a `TrainingError` if a step since the last call cannot be trusted."""
+        """Raise a `TrainingError` if a step since the last call is invalid."""
         ...
 
     def save(self) -> dict[str, NDArray]:
-        """Everything that a later step depends on."""
+        """Return everything that a later step depends on."""
         ...
 
     def load(self, saved: dict[str, NDArray]) -> None:
-        """Go on from what `save` returned."""
+        """Continue from what `save` returned."""
         ...

@@ -1,4 +1,4 @@
-"""MuJoCo's batch API: the C engine of the evaluation, on a few threads."""
+"""Training on MuJoCo's batch API, the engine of the evaluation, on several CPU threads."""
 
 from types import SimpleNamespace
 
@@ -9,7 +9,7 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.training.backends.base import Start, State, columns_of, state_of
+from wbc_baselines.learned.training.backends.base import ResetState, State, columns_of, state_of
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.simulation import FATAL_WARNINGS, places_of
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
@@ -20,7 +20,7 @@ _MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "act
 
 
 class CpuBackend:
-    """N simulations on `threads` threads; the result does not depend on how many."""
+    """N simulations on `threads` threads; the result does not depend on the number of threads."""
 
     def __init__(self, protocol: EvalProtocol, num_envs: int, threads: int) -> None:
         self.num_envs, self.device = num_envs, torch.device("cpu")
@@ -35,9 +35,9 @@ class CpuBackend:
         self._columns = columns_of(places_of(model), self.device)
         self._base = model.body(robot.facts.base).id
 
-    def reset(self, ids: Tensor, start: Start) -> State:
+    def reset(self, ids: Tensor, reset: ResetState) -> State:
         rows: NDArray[np.int64] = ids.numpy()
-        drawn = SimpleNamespace(**{name: column.numpy() for name, column in start._asdict().items()})
+        drawn = SimpleNamespace(**{name: column.numpy() for name, column in reset._asdict().items()})
         self._randomise(rows, drawn)
         self._batch.reset(rows, stage=_STAGE_NONE)
         default = self._robot.default_q
@@ -50,17 +50,17 @@ class CpuBackend:
         self._batch.forward(rows)
         return self._read(rows)
 
-    def _randomise(self, ids: NDArray[np.int64], start: SimpleNamespace) -> None:
+    def _randomise(self, ids: NDArray[np.int64], reset: SimpleNamespace) -> None:
         """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
         model, fields, base = self._model, self._fields, self._base
         # the larger coefficient of a pair counts, so both sides carry the draw
-        fields["geom_friction"][ids, :, 0] = start.friction[:, None]
-        mass = model.body_mass[base] + start.base_mass
+        fields["geom_friction"][ids, :, 0] = reset.friction[:, None]
+        mass = model.body_mass[base] + reset.base_mass
         fields["body_mass"][ids, base] = mass
         fields["body_inertia"][ids, base] = model.body_inertia[base] * (mass / model.body_mass[base])[:, None]
-        fields["actuator_gainprm"][ids, :, 0] = model.actuator_gainprm[:, 0] * start.kp_scale
-        fields["actuator_biasprm"][ids, :, 1] = model.actuator_biasprm[:, 1] * start.kp_scale
-        fields["actuator_biasprm"][ids, :, 2] = model.actuator_biasprm[:, 2] * start.kd_scale
+        fields["actuator_gainprm"][ids, :, 0] = model.actuator_gainprm[:, 0] * reset.kp_scale
+        fields["actuator_biasprm"][ids, :, 1] = model.actuator_biasprm[:, 1] * reset.kp_scale
+        fields["actuator_biasprm"][ids, :, 2] = model.actuator_biasprm[:, 2] * reset.kd_scale
         self._batch.set_const(ids)
 
     def push(self, velocity_w: Tensor) -> None:

@@ -1,9 +1,9 @@
 """mujoco_warp on a GPU: thousands of simulations of the same model, in single precision.
 
-Runs on a GPU are not deterministic, so it is for training alone. Buffers are of fixed size: a world whose
-constraints overflow counts as diverged, an overflow of the contacts of all ends the run. At the start of an
-episode no contact has been solved yet, so the soles' forces are zero there, where `mujoco.batch` has those of
-its forward pass.
+Runs on a GPU are not deterministic, so this backend is for training only. Buffers have a fixed size: a world
+whose constraints overflow counts as diverged, and an overflow of the contacts of all worlds ends the run. At
+the start of an episode no contact has been solved yet, so the forces on the soles are zero there, where
+`mujoco.batch` has those of its forward pass.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.training.backends.base import Start, State, columns_of, state_of
+from wbc_baselines.learned.training.backends.base import ResetState, State, columns_of, state_of
 from wbc_baselines.learned.training.config import TrainingError
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.simulation import places_of
@@ -37,7 +37,7 @@ _OF_ONE = int(mjw.OverflowType.NEFC | mjw.OverflowType.NJMAX_NNZ | mjw.OverflowT
 
 
 class WarpBackend:
-    """N worlds on a GPU, or on a CPU for a test."""
+    """N worlds on a GPU, or on a CPU for tests."""
 
     def __init__(self, protocol: EvalProtocol, num_envs: int, device: str = "cuda") -> None:
         if device == "cuda" and not wp.is_cuda_available():
@@ -97,7 +97,7 @@ class WarpBackend:
         mjw.kinematics(self._m, self._d)
 
     def _launch(self, work: Callable[[], None]) -> None:
-        """Do `work`, of which a GPU keeps a graph: thousands of small kernels in one launch."""
+        """Run `work`; on a GPU as a captured graph, which launches thousands of small kernels at once."""
         if self.device.type == "cpu":
             work()
             return
@@ -114,38 +114,38 @@ class WarpBackend:
         stream = wp.stream_from_torch(torch.cuda.current_stream(self.device))
         wp.capture_launch(self._graphs[work], stream=stream)
 
-    def reset(self, ids: Tensor, start: Start) -> State:
-        start = Start(*(column.float() for column in start))
-        self._randomise(ids, start)
+    def reset(self, ids: Tensor, reset: ResetState) -> State:
+        reset = ResetState(*(column.float() for column in reset))
+        self._randomise(ids, reset)
         default, count = self._default_q, len(ids)
         qpos, qvel = torch.zeros(count, 21, device=self.device), torch.zeros(count, 20, device=self.device)
-        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = start.base_height, 1.0, default
-        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += start.leg_q
-        qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = start.base_vel, start.leg_qd
+        qpos[:, 2], qpos[:, 3], qpos[:, 7:] = reset.base_height, 1.0, default
+        qpos[:, 7 : 7 + NUM_LEG_JOINTS] += reset.leg_q
+        qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = reset.base_vel, reset.leg_qd
         self._state["qpos"][ids], self._state["qvel"][ids] = qpos, qvel
         self._state["ctrl"][ids] = default
         self._state["qacc_warmstart"][ids] = 0.0
         self._state["time"][ids] = 0.0
         self._launch(self._place)
         # no forward pass for a few worlds of many: the PD law gives its torque
-        torque = self._kp * start.kp_scale * (default - qpos[:, 7:]) - self._kd * start.kd_scale * qvel[:, 6:]
+        torque = self._kp * reset.kp_scale * (default - qpos[:, 7:]) - self._kd * reset.kd_scale * qvel[:, 6:]
         self._out["actuator_force"][ids] = torque.clamp(-self._effort, self._effort)
         self._out["sensordata"][ids] = 0.0
         self._out["overflow"][ids] &= _OF_ALL
         return self._read(ids)
 
-    def _randomise(self, ids: Tensor, start: Start) -> None:
+    def _randomise(self, ids: Tensor, reset: ResetState) -> None:
         """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
         fields, base = self._fields, self._base
         # the larger coefficient of a pair counts, so both sides carry the draw
-        fields["geom_friction"][ids, :, 0] = start.friction[:, None]
-        mass = self._mass + start.base_mass
+        fields["geom_friction"][ids, :, 0] = reset.friction[:, None]
+        mass = self._mass + reset.base_mass
         fields["body_mass"][ids, base] = mass
         fields["body_inertia"][ids, base] = self._inertia * (mass / self._mass)[:, None]
-        fields["actuator_gainprm"][ids, :, 0] = self._gain[:, 0] * start.kp_scale
-        fields["actuator_biasprm"][ids, :, 1] = self._bias[:, 1] * start.kp_scale
-        fields["actuator_biasprm"][ids, :, 2] = self._bias[:, 2] * start.kd_scale
-        place = ((start.base_mass - self._lightest) / self._span).clamp(0, 1) * (KNOTS - 1)
+        fields["actuator_gainprm"][ids, :, 0] = self._gain[:, 0] * reset.kp_scale
+        fields["actuator_biasprm"][ids, :, 1] = self._bias[:, 1] * reset.kp_scale
+        fields["actuator_biasprm"][ids, :, 2] = self._bias[:, 2] * reset.kd_scale
+        place = ((reset.base_mass - self._lightest) / self._span).clamp(0, 1) * (KNOTS - 1)
         below = place.long().clamp(max=KNOTS - 2)
         for name, table in self._derived.items():
             part = (place - below).reshape(-1, *[1] * (table.ndim - 1))
