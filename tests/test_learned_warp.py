@@ -20,8 +20,8 @@ PROTOCOL = find_protocol("ablation_v1")[0]
 
 def test_the_back_ends_agree_over_a_third_of_a_second():
     """Two robots with their own mass, friction and gains, onto the ground, 15 steps of 2 ms x 10."""
-    draws = sample_episodes(PROTOCOL, read_target_set(PROTOCOL), 2, stream(4, "test"))
-    start = draws.start._replace(leg_q=0.2 * draws.start.leg_q)
+    samples = sample_episodes(PROTOCOL, read_target_set(PROTOCOL), 2, stream(4, "test"))
+    start = samples.reset._replace(leg_q=0.2 * samples.reset.leg_q)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     cpu, warp = CpuBackend(PROTOCOL, 2, 1), WarpBackend(PROTOCOL, 2, device)
     first = [
