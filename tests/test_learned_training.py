@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -377,6 +378,13 @@ def test_a_killed_run_resumes(tmp_path):
     assert [row["iteration"] for row in folder.read_metrics()] == list(range(1, done + 3))
 
 
+def test_a_damaged_configuration_is_one_line(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.config.write_text('{"method": "no_la')
+    with pytest.raises(TrainingError, match=r"config\.json' is damaged"):
+        run(TINY, folder, tensorboard=False)
+
+
 def test_claims(tmp_path):
     """One process at a time; a dead process's claim and a stale one are taken over."""
     one, two = RunFolder(tmp_path), RunFolder(tmp_path)
@@ -387,6 +395,9 @@ def test_claims(tmp_path):
     dead.wait()
     one.claim.write_text(one.claim.read_text().split()[0] + f" {dead.pid}")
     assert one.take()
+    # a container that is started again: the same number, another process
+    one.claim.write_text(f"{socket.gethostname()} {os.getpid()} 1")
+    assert two.take()
     one.claim.write_text("elsewhere 1")
     assert not two.take()
     os.utime(one.claim, (0, 0))

@@ -193,3 +193,21 @@ def test_the_families_share_their_targets() -> None:
             np.testing.assert_array_equal(other.witness_qpos, first.witness_qpos)
         np.testing.assert_array_equal(others[0].friction, first.friction)
         assert len(set(first.stratum[:3])) == 3 and (first.stratum[:3] == first.stratum[3:6]).all()
+
+
+def test_a_released_manifest_is_never_written(capsys, tmp_path):
+    path = PROTOCOLS / "smoke_v1.parquet"
+    before = path.read_bytes()
+    with pytest.raises(ManifestError, match="released and never written anew"):
+        freeze(SMOKE, path)
+    assert path.read_bytes() == before and not list(PROTOCOLS.glob(".smoke*"))
+
+
+def test_a_protocol_of_ones_own_may_not_bear_a_released_name(tmp_path):
+    text = SMOKE_FILE.read_text()
+    file = tmp_path / "mine.toml"
+    file.write_text(text)
+    assert find_protocol(str(file))[0] == SMOKE  # a copy asks the same
+    file.write_text(text.replace("seed = ", "seed = 1"))
+    with pytest.raises(ProtocolError, match=r"'smoke_v1' is the name of a released.*`\$\.name`"):
+        find_protocol(str(file))

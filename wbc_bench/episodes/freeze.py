@@ -13,6 +13,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest, write_manifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.targets import Progress
 from wbc_bench.errors import ManifestError
+from wbc_bench.files import PROTOCOLS
 
 
 def freeze(
@@ -25,8 +26,9 @@ def freeze(
 
     Raises:
         ProtocolError: a stratum or a height that cannot be filled.
-        ManifestError: the folder cannot be written.
+        ManifestError: the manifest is a released one, or the folder cannot be written.
     """
+    _refuse_released(path)
     manifest = build_manifest(protocol, progress, workers)
     try:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}_") as folder:
@@ -43,6 +45,14 @@ def freeze(
     except OSError as error:
         raise ManifestError(f"manifest '{path}' cannot be written: {error.strerror or error}") from error
     return sha256
+
+
+def _refuse_released(path: Path) -> None:
+    """Raises: ManifestError, the file is a released manifest: another processor would give it other bytes."""
+    if path.exists() and path.resolve().parent == PROTOCOLS.resolve():
+        raise ManifestError(
+            f"manifest '{path}' is released and never written anew: copy the protocol under another name"
+        )
 
 
 def build_manifest(

@@ -218,7 +218,15 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
         path = PROTOCOLS / f"{name}.toml"
         if not path.exists():
             raise UnknownNameError("protocol", name, protocol_names(), "--protocol")
-    return read_protocol(path), path
+    protocol = read_protocol(path)
+    released = PROTOCOLS / f"{protocol.name}.toml"
+    own = path.resolve() != released.resolve()
+    if own and released.exists() and protocol.digest != read_protocol(released).digest:
+        raise ProtocolError(
+            f"protocol {path}: '{protocol.name}' is the name of a released protocol, and this one differs: "
+            "give it another - at `$.name`"
+        )
+    return protocol, path
 
 
 def load_protocol(name: str) -> EvalProtocol:

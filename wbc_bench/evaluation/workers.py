@@ -5,6 +5,7 @@ Workers return rows; only the client writes.
 
 import os
 import resource
+import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -91,7 +92,11 @@ def _work_for(client: int, task: Task) -> Result:
 
 @cache
 def _leave_with(client: int) -> None:
-    """End this process once its parent is gone: loky's workers outlive a killed one, holding their memory."""
+    """End this process once its parent is gone: loky's workers outlive a killed one, holding their memory.
+
+    Until then its parent alone answers an interrupt, with one line instead of a traceback per worker.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
         while os.getppid() == client:

@@ -74,7 +74,13 @@ class RunFolder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         if self.config.exists():
-            changed = config.changes(json.loads(self.config.read_text()))
+            try:
+                before = json.loads(self.config.read_text())
+            except ValueError as error:
+                raise TrainingError(
+                    f"configuration '{self.config}' is damaged ({error}): give another --out"
+                ) from error
+            changed = config.changes(before)
             fixed = ("method", "seed", "protocol")  # what the run is called and judged by
             wrong = {n: c for n, c in changed.items() if not change or n in fixed}
             if wrong:
@@ -135,8 +141,11 @@ class RunFolder:
 
     def _is_dead(self) -> bool:
         """Whether the claim belongs to a process of this machine that has ended."""
-        host, _, pid = self.claim.read_text().partition(" ")
-        return host == socket.gethostname() and pid.isdigit() and not Path(f"/proc/{pid}").exists()
+        host, pid, started, *_ = [*self.claim.read_text().split(), "", "", ""]
+        if host != socket.gethostname() or not pid.isdigit():
+            return False
+        running = _start_of(pid)
+        return not running or (bool(started) and running != started)
 
     def touch(self) -> None:
         """Update the time of the claim, so that it is not taken over."""
@@ -306,4 +315,15 @@ def _ends_with_newline(file) -> bool:
 
 
 def _me() -> str:
-    return f"{socket.gethostname()} {os.getpid()}"
+    return f"{socket.gethostname()} {os.getpid()} {_start_of(os.getpid())}"
+
+
+def _start_of(pid: int | str) -> str:
+    """When a process of this machine began, in ticks since boot; "" if there is none.
+
+    A container that is started again gives its processes the same numbers. Source: proc(5), field 22 of stat.
+    """
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (OSError, IndexError):
+        return ""
