@@ -41,7 +41,7 @@ from wbc_bench.sources.diffusion.policy import (
 )
 from wbc_bench.sources.diffusion.scene import CLOSED, GRIP, STANDOFF, Door, DoorScene, draw_door
 from wbc_bench.sources.diffusion.source import DiffusionSource
-from wbc_bench.sources.library import POLICY
+from wbc_bench.sources.registry import POLICY
 from wbc_bench.sources.slew import Pose
 
 DOOR = Door(x=0.68, y=0.1, z=1.1, yaw=0.1, angle=0.6)

@@ -20,7 +20,7 @@ from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
-from wbc_bench.sources.player import PlayedStream
+from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import ScriptedSource
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
 
 def natural_duration(source: Source) -> float:
     """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources."""
-    script = source.script if isinstance(source, ScriptedSource | PlayedStream) else None
+    script = source.script if isinstance(source, ScriptedSource | ReplayedStream) else None
     if script is None:
         return UNSCRIPTED
     protocol = _protocol(UNSCRIPTED, seed=0)
@@ -125,7 +125,7 @@ def natural_duration(source: Source) -> float:
 
 def _digest(source: Source) -> str | None:
     """SHA-256 of the script or the policy that decides the targets."""
-    if isinstance(source, ScriptedSource | PlayedStream):
+    if isinstance(source, ScriptedSource | ReplayedStream):
         return source.script.digest
     return source.digest if isinstance(source, SceneSource) else None
 

@@ -17,10 +17,10 @@ import pinocchio as pin
 import qpsolvers
 from numpy.typing import NDArray
 
+from wbc_baselines.ik.config import TUNED, Weights
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
-from wbc_baselines.ik.settings import TUNED, Weights
 from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
@@ -29,7 +29,7 @@ from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
 
 Array = NDArray[np.float64]
 PERIOD = 0.02  # [s]
-SLEW = 35  # steps until the target has arrived, as in `reference.plan`
+SLEW = 35  # steps until the target has arrived, as in `reference.plan_goal_posture`
 POSITION_AND_PITCH = [0, 1, 2, 4]  # of a foot's twist in its own frame
 QP_SOLVERS = ("daqp", "quadprog", "proxqp", "osqp")  # for Pink and mink: the fastest here first
 

@@ -8,7 +8,7 @@ from wbc_bench.errors import SourceError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.sources.interface import Source
 from wbc_bench.sources.live import LIVE, LiveSource
-from wbc_bench.sources.player import PlayedStream
+from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
 
@@ -74,7 +74,7 @@ def load_source(
         return StreamSource(address, allow_remote=allow_remote)
     if name.startswith("stream:"):
         script = ScriptedSource(find_script(name.removeprefix("stream:")))
-        return PlayedStream(script, StreamSource(address, allow_remote=allow_remote))
+        return ReplayedStream(script, StreamSource(address, allow_remote=allow_remote))
     return ScriptedSource(find_script(name))
 
 
