@@ -307,7 +307,7 @@ def test_reference_keeps_its_speed_and_arrives() -> None:
 def test_plan_reaches_posture_targets() -> None:
     protocol, path = find_protocol("tuning_nominal_v1")
     rows, _ = read_manifest(protocol, manifest_path(path))
-    lean = np.arccos(matrix_from_wxyz(rows.witness_qpos[:, 3:7])[:, 2, 2])
+    lean = np.arccos(matrix_from_wxyz(rows.feasible_qpos[:, 3:7])[:, 2, 2])
     # plans do not lean further, so they miss targets that are out of reach of a base that leans less
     rows = rows.take(np.flatnonzero((rows.stratum == "posture") & (lean < MAX_LEAN))[:8])
     q = standing()

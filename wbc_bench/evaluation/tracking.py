@@ -60,11 +60,11 @@ def follow(
     source: Source,
     protocol: EvalProtocol,
     row: EpisodeManifest,
-    watch: Callable[[Moment], None] = lambda moment: None,
+    on_step: Callable[[Moment], None] = lambda moment: None,
 ) -> Tracked:
     """The series of one episode (a manifest of one row, whose target nobody looks at).
 
-    `watch` is told of every control step that was taken.
+    `on_step` is called after every control step that was taken.
     """
     period = protocol.control_period
     furnished = source if isinstance(source, SceneSource) else None
@@ -84,9 +84,9 @@ def follow(
         target = target_in_base(loop.state, pos_w[None], rot_w[None])
         if step == 0:
             loop.reset(target)
-        if not loop.advance(target).ran.any():
+        if not loop.advance(target).stepped.any():
             break
-        watch(Moment(seen, pos_w, rot_w, scenery))
+        on_step(Moment(seen, pos_w, rot_w, scenery))
         series.add(pos_w, rot_w, seen.ee_pos_w, seen.ee_rot_w)
         if not loop.active.any():
             break

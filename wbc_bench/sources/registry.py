@@ -13,7 +13,7 @@ from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
 
 if TYPE_CHECKING:
-    from wbc_bench.sources.diffusion.policy import Card, Policy
+    from wbc_bench.sources.diffusion.policy import DoorPolicyCard, Policy
 
 SCRIPTS = PROTOCOLS / "scripts"
 POLICY = Path(__file__).parent / "diffusion" / "door.safetensors"  # of `diffusion` without a file
@@ -78,7 +78,7 @@ def load_source(
     return ScriptedSource(find_script(name))
 
 
-def find_policy(file: str = "") -> "tuple[Policy, Card, str]":
+def find_policy(file: str = "") -> "tuple[Policy, DoorPolicyCard, str]":
     """The diffusion policy of a file, by default the packaged one, its card and its SHA-256.
 
     Raises: SourceError when the file is missing or damaged, or torch or safetensors is not installed.
