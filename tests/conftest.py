@@ -9,7 +9,7 @@ from tiny_protocol import manifest
 
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
-from wbc_bench.episodes.randomization import undisturbed
+from wbc_bench.episodes.randomization import nominal
 
 CalmRows = Callable[..., EpisodeManifest]
 
@@ -24,7 +24,7 @@ def calm_rows(smoke: EvalProtocol) -> CalmRows:
     """`calm_rows(count, column=values, ...)`: nominal robots at rest, without pushes or noise."""
 
     def rows(count: int, **columns: np.ndarray) -> EpisodeManifest:
-        draws = [undisturbed(smoke, 0, i)._asdict() for i in range(count)]
+        draws = [nominal(smoke, 0, i)._asdict() for i in range(count)]
         still = {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
         return dataclasses.replace(manifest(1, count), **(still | columns))
 

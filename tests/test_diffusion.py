@@ -34,14 +34,14 @@ from wbc_bench.sources.diffusion.policy import (
     HORIZON,
     LOOK,
     LOOKS,
-    Card,
+    DoorPolicyCard,
     Policy,
     load_policy,
     save_policy,
 )
 from wbc_bench.sources.diffusion.scene import CLOSED, GRIP, STANDOFF, Door, DoorScene, draw_door
 from wbc_bench.sources.diffusion.source import DiffusionSource
-from wbc_bench.sources.library import POLICY
+from wbc_bench.sources.registry import POLICY
 from wbc_bench.sources.slew import Pose
 
 DOOR = Door(x=0.68, y=0.1, z=1.1, yaw=0.1, angle=0.6)
@@ -68,10 +68,10 @@ def seen_at(hand: Pose) -> Seen:
     return Seen(hand.pos, hand.rot, np.array([0.0, 0.0, 0.84]), np.eye(3), np.zeros(3))
 
 
-def card(**changed) -> Card:
+def card(**changed) -> DoorPolicyCard:
     facts = {"format": 1, "seed": 0, "demonstrations": 1, "demonstrations_seed": 0, "samples": 1, "steps": 1}
     facts |= {"demonstrations_sha256": "0" * 64, "batch": 1, "hidden": 16, "git_commit": None}
-    return Card(**facts | {"git_dirty": False, "torch": "0"} | changed)  # pyright: ignore[reportArgumentType]
+    return DoorPolicyCard(**facts | {"git_dirty": False, "torch": "0"} | changed)  # pyright: ignore[reportArgumentType]
 
 
 # the scene

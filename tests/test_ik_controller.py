@@ -8,14 +8,14 @@ import pinocchio as pin
 import pytest
 
 from wbc_baselines.ik import make
-from wbc_baselines.ik.balance import distribute, friction_rays
+from wbc_baselines.ik.arm_servo import solve_arm
+from wbc_baselines.ik.balance import distribute_contact_forces, friction_rays
+from wbc_baselines.ik.config import TUNED
 from wbc_baselines.ik.controller import PERIOD, IKController, moment_of
 from wbc_baselines.ik.estimation import ComFilter, GravityFilter, JointFilter, uniform_variance
-from wbc_baselines.ik.hand import solve_arm
 from wbc_baselines.ik.model import GRAVITY, WholeBodyModel, configuration
 from wbc_baselines.ik.placo_ik import PlacoIK
-from wbc_baselines.ik.reference import MAX_LEAN, Reference, plan
-from wbc_baselines.ik.settings import TUNED
+from wbc_baselines.ik.reference import MAX_LEAN, Reference, plan_goal_posture
 from wbc_baselines.ik.stance import base_from_stance, measured_stance
 from wbc_bench.controller import Observation, Proprioception, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
@@ -188,7 +188,7 @@ def test_forces_reproduce_a_feasible_wrench_inside_the_pyramid(seed: int) -> Non
     wanted = rng.uniform(0.0, 1.0, (len(points), len(rays))) @ rays
     wanted *= MODEL.mass * GRAVITY / wanted[:, 2].sum()
     wrench = np.concatenate([wanted.sum(axis=0), moment_of(points, wanted)])
-    forces = distribute(points, rays, wrench, np.ones(6), 1e-3)
+    forces = distribute_contact_forces(points, rays, wrench, np.ones(6), 1e-3)
     found = np.concatenate([forces.sum(axis=0), moment_of(points, forces)])
     np.testing.assert_allclose(found, wrench, atol=1e-3)
     assert (np.abs(forces[:, :2]).max(axis=1) <= 0.4 / np.sqrt(2) * forces[:, 2] + 1e-9).all()
@@ -198,7 +198,7 @@ def test_forces_reproduce_a_feasible_wrench_inside_the_pyramid(seed: int) -> Non
 def test_no_force_pulls_at_the_ground() -> None:
     points, _ = contacts()
     wrench = np.array([300.0, 0.0, -50.0, 0.0, 200.0, 0.0])  # nothing a foot can do
-    forces = distribute(points, friction_rays(0.4), wrench, np.ones(6), 0.02)
+    forces = distribute_contact_forces(points, friction_rays(0.4), wrench, np.ones(6), 0.02)
     assert np.isfinite(forces).all() and (forces[:, 2] >= 0.0).all()
 
 
@@ -212,7 +212,7 @@ def carried() -> tuple[np.ndarray, np.ndarray]:
     """A standing configuration (21,) and the forces (20,) of the contacts that carry it."""
     points, q = contacts()
     wrench = np.array([0.0, 0.0, MODEL.mass * GRAVITY, 0.0, 0.0, 0.0])
-    forces = distribute(
+    forces = distribute_contact_forces(
         points,
         friction_rays(TUNED.friction),
         wrench,
@@ -240,8 +240,8 @@ def test_static_balance_leaves_nothing_on_the_base() -> None:
 
 def test_the_controller_sends_the_torques_of_static_balance() -> None:
     """With zero error, `_balance` is gravity less the contact forces it plans."""
-    settings = replace(TUNED, feedback=False, sole_width=1.0, damping=1e-4)
-    controller = IKController(ROBOT, None, settings)
+    config = replace(TUNED, feedback=False, sole_width=1.0, damping=1e-4)
+    controller = IKController(ROBOT, None, config)
     q = standing()
     obs, target = _observation(1, q)
     controller.reset(np.arange(1), obs, target)
@@ -307,7 +307,7 @@ def test_reference_keeps_its_speed_and_arrives() -> None:
 def test_plan_reaches_posture_targets() -> None:
     protocol, path = find_protocol("tuning_nominal_v1")
     rows, _ = read_manifest(protocol, manifest_path(path))
-    lean = np.arccos(matrix_from_wxyz(rows.witness_qpos[:, 3:7])[:, 2, 2])
+    lean = np.arccos(matrix_from_wxyz(rows.feasible_qpos[:, 3:7])[:, 2, 2])
     # plans do not lean further, so they miss targets that are out of reach of a base that leans less
     rows = rows.take(np.flatnonzero((rows.stratum == "posture") & (lean < MAX_LEAN))[:8])
     q = standing()
@@ -316,7 +316,7 @@ def test_plan_reaches_posture_targets() -> None:
     stance = measured_stance([MODEL.pose(sole) for sole in MODEL.soles])
     solver = PlacoIK(ROBOT, TUNED.weights, PERIOD)
     for pos, quat in zip(rows.target_pos_w, rows.target_quat_w, strict=True):
-        joints, error = plan(
+        joints, error = plan_goal_posture(
             solver,
             MODEL,
             q,

@@ -7,10 +7,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from wbc_baselines.ik.config import Weights
 from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
-from wbc_baselines.ik.settings import Weights
 from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol

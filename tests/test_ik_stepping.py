@@ -6,12 +6,19 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from wbc_baselines.ik import make
+from wbc_baselines.ik.config import TUNED
 from wbc_baselines.ik.controller import PERIOD
 from wbc_baselines.ik.estimation import ComFilter
 from wbc_baselines.ik.model import GRAVITY, WholeBodyModel, configuration
-from wbc_baselines.ik.settings import TUNED
 from wbc_baselines.ik.stance import Stance, base_from_sole, measured_stance, yaw_matrix
-from wbc_baselines.ik.stepping import Swing, choose, landing, outside, pressure, solve_leg
+from wbc_baselines.ik.stepping import (
+    Swing,
+    center_of_pressure,
+    choose_swing_foot,
+    outside,
+    plan_foothold,
+    solve_leg,
+)
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.evaluation.rollout import rollout
@@ -54,25 +61,25 @@ def test_pressure_is_the_nearest_point_of_the_sole() -> None:
     sole = xy + grid.reshape(-1, 2) @ yaw_matrix(yaw)[:2, :2].T
     for point in np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2)):
         nearest = sole[np.argmin(np.linalg.norm(sole - point, axis=1))]
-        np.testing.assert_allclose(pressure(point, xy, yaw, MODEL.corners), nearest, atol=1e-3)
+        np.testing.assert_allclose(center_of_pressure(point, xy, yaw, MODEL.corners), nearest, atol=1e-3)
 
 
 def test_the_foot_lands_where_the_capture_point_will_be() -> None:
     """Ahead of the toes of the standing foot the capture point runs away as in the integrated pendulum."""
     capture, left = np.array([0.12, 0.0]), 0.2
-    p = pressure(capture, STANCE.xy[1], 0.0, MODEL.corners)
+    p = center_of_pressure(capture, STANCE.xy[1], 0.0, MODEL.corners)
     run = solve_ivp(lambda _, xi: RATE * (xi - p), (0, left), capture, rtol=1e-9).y[:, -1]
-    where = landing(TUNED, STANCE, 0, capture, RATE, left, MODEL.corners)
+    where = plan_foothold(TUNED, STANCE, 0, capture, RATE, left, MODEL.corners)
     middle = MODEL.corners[:, 0].mean()
     np.testing.assert_allclose(where.xy, run + np.array([-middle, TUNED.step_beside]), atol=1e-6)
     assert where.miss == 0.0
 
 
 def test_landing_stays_in_reach_and_says_what_it_misses() -> None:
-    where = landing(TUNED, STANCE, 0, np.array([0.5, 0.0]), RATE, 0.25, MODEL.corners)
+    where = plan_foothold(TUNED, STANCE, 0, np.array([0.5, 0.0]), RATE, 0.25, MODEL.corners)
     assert where.xy[0] == pytest.approx(TUNED.step_length)
     assert where.miss > 0.1
-    crossed = landing(TUNED, STANCE, 0, np.array([0.1, -0.3]), RATE, 0.25, MODEL.corners)
+    crossed = plan_foothold(TUNED, STANCE, 0, np.array([0.1, -0.3]), RATE, 0.25, MODEL.corners)
     assert crossed.xy[1] - STANCE.xy[1, 1] == pytest.approx(TUNED.step_width[0])
 
 
@@ -81,17 +88,17 @@ def test_landing_turns_with_the_stance() -> None:
     turned = Stance(STANCE.xy @ turn.T, STANCE.yaw + 0.7)
     capture = np.array([0.13, 0.02])
     for side in (0, 1):
-        here = landing(TUNED, STANCE, side, capture, RATE, 0.25, MODEL.corners)
-        there = landing(TUNED, turned, side, turn @ capture, RATE, 0.25, MODEL.corners)
+        here = plan_foothold(TUNED, STANCE, side, capture, RATE, 0.25, MODEL.corners)
+        there = plan_foothold(TUNED, turned, side, turn @ capture, RATE, 0.25, MODEL.corners)
         np.testing.assert_allclose(there.xy, turn @ here.xy, atol=1e-12)
 
 
 def test_the_mirror_image_steps_with_the_other_foot() -> None:
     for capture in np.array([(0.15, 0.03), (-0.12, 0.05), (0.1, 0.08)]):
-        side = choose(TUNED, STANCE, capture, RATE, MODEL.corners)
-        assert choose(TUNED, STANCE, capture * [1, -1], RATE, MODEL.corners) == 1 - side
-        here = landing(TUNED, STANCE, side, capture, RATE, 0.25, MODEL.corners)
-        there = landing(TUNED, STANCE, 1 - side, capture * [1, -1], RATE, 0.25, MODEL.corners)
+        side = choose_swing_foot(TUNED, STANCE, capture, RATE, MODEL.corners)
+        assert choose_swing_foot(TUNED, STANCE, capture * [1, -1], RATE, MODEL.corners) == 1 - side
+        here = plan_foothold(TUNED, STANCE, side, capture, RATE, 0.25, MODEL.corners)
+        there = plan_foothold(TUNED, STANCE, 1 - side, capture * [1, -1], RATE, 0.25, MODEL.corners)
         np.testing.assert_allclose(there.xy, here.xy * [1, -1], atol=1e-12)
 
 

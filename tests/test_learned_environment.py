@@ -462,7 +462,7 @@ def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
 def test_weakened_disturbances_lie_between_none_and_the_protocols():
     """At 0 the nominal robot of the evaluation, at 1 the protocol itself, halfway in between."""
     assert scale_disturbances(PROTOCOL, 1.0) is PROTOCOL
-    none = randomization.undisturbed(PROTOCOL, 0, 0)
+    none = randomization.nominal(PROTOCOL, 0, 0)
     samples = sample_episodes(scale_disturbances(PROTOCOL, 0.0), TARGETS, 5, stream(3, "test"))
     for name, value in samples.reset._asdict().items():
         np.testing.assert_allclose(value, np.broadcast_to(getattr(none, name), value.shape), err_msg=name)

@@ -113,7 +113,7 @@ def test_an_unwritable_folder_is_one_line(tmp_path: Path) -> None:
         ("friction", 2.0, "range of friction"),
         ("leg_q", 0.09, "soles on the ground at reset"),
         ("target_pos_w", 0.5, "witnesses reach their targets"),
-        ("witness_qpos", 0.02, "feasibility of a sample"),
+        ("feasible_qpos", 0.02, "feasibility of a sample"),
         ("stratum", "step", "counts"),
         ("push_vel", 0.1, "redrawn sample"),
         ("noise_key", 1, "redrawn sample"),
@@ -155,7 +155,9 @@ def test_a_ladder_of_heights(tmp_path: Path) -> None:
     assert (np.abs(manifest.target_pos_w[:, 1]) <= 0.01).all()
     beyond = manifest.stratum == BEYOND
     assert beyond.tolist() == [False, False, True, True] * 2
-    assert np.isnan(manifest.witness_qpos[beyond]).all() and np.isfinite(manifest.witness_qpos[~beyond]).all()
+    assert (
+        np.isnan(manifest.feasible_qpos[beyond]).all() and np.isfinite(manifest.feasible_qpos[~beyond]).all()
+    )
     # no pose at 2.5 m: the one of 1.0 m is lifted
     assert (np.abs(manifest.target_pos_w[2, 0] - manifest.target_pos_w[0, 0]) <= 0.02).all()
     nominal = manifest.condition == "nominal"
@@ -190,7 +192,7 @@ def test_the_families_share_their_targets() -> None:
         first, *others = [targets(name) for name in family]
         for other in others:
             np.testing.assert_array_equal(other.target_pos_w, first.target_pos_w)
-            np.testing.assert_array_equal(other.witness_qpos, first.witness_qpos)
+            np.testing.assert_array_equal(other.feasible_qpos, first.feasible_qpos)
         np.testing.assert_array_equal(others[0].friction, first.friction)
         assert len(set(first.stratum[:3])) == 3 and (first.stratum[:3] == first.stratum[3:6]).all()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from wbc_bench.episodes.protocol import MAX_PUSHES, Push, find_protocol
-from wbc_bench.episodes.randomization import EpisodeDraws, draw, draw_pushes, resting_height, undisturbed
+from wbc_bench.episodes.randomization import EpisodeDraws, draw_pushes, nominal, resting_height, sample
 from wbc_bench.randomness import stream
 from wbc_bench.robot import load_robot
 
@@ -18,17 +18,17 @@ def equal(a: EpisodeDraws, b: EpisodeDraws) -> bool:
 
 
 def test_order_and_subset_do_not_matter() -> None:
-    forward = {i: draw(SMOKE, 0, i) for i in range(6)}
-    assert all(equal(draw(SMOKE, 0, i), forward[i]) for i in (5, 2))
+    forward = {i: sample(SMOKE, 0, i) for i in range(6)}
+    assert all(equal(sample(SMOKE, 0, i), forward[i]) for i in (5, 2))
     assert not equal(forward[0], forward[1])
-    assert not equal(forward[0], draw(SMOKE, 1, 0))
+    assert not equal(forward[0], sample(SMOKE, 1, 0))
 
 
 def test_switching_one_quantity_off_leaves_the_others() -> None:
     calm = msgspec.structs.replace(
         SMOKE, push=Push(), randomization=msgspec.structs.replace(SMOKE.randomization, friction=(0.8, 0.8))
     )
-    a, b = draw(SMOKE, 0, 3), draw(calm, 0, 3)
+    a, b = sample(SMOKE, 0, 3), sample(calm, 0, 3)
     changed = {
         name
         for name in EpisodeDraws._fields
@@ -38,7 +38,7 @@ def test_switching_one_quantity_off_leaves_the_others() -> None:
 
 
 def test_draws_fill_their_ranges() -> None:
-    draws = [draw(SMOKE, 0, i) for i in range(400)]
+    draws = [sample(SMOKE, 0, i) for i in range(400)]
     spread = SMOKE.randomization
     for name, low, high in (
         ("friction", *spread.friction),
@@ -75,8 +75,8 @@ def test_pushes_keep_to_the_schedule() -> None:
     assert np.isnan(time).all() and (vel == 0).all()
 
 
-def test_undisturbed_is_nominal() -> None:
-    calm = undisturbed(SMOKE, 0, 4)
+def test_the_nominal_robot_is_at_rest_and_undisturbed() -> None:
+    calm = nominal(SMOKE, 0, 4)
     robot = load_robot()
     assert calm.friction == robot.facts.friction.slide and calm.noise_scale == 0
     assert calm.base_mass == 0 and not calm.base_vel.any() and not calm.leg_q.any() and not calm.leg_qd.any()
@@ -91,7 +91,7 @@ def test_lowest_sole_touches_the_ground() -> None:
     ground = model.geom("ground").id
     spheres = [model.geom(f"foot_{side}_{k}").id for side in "LR" for k in range(4)]
     for i in range(5):
-        leg_q = draw(SMOKE, 0, i).leg_q
+        leg_q = sample(SMOKE, 0, i).leg_q
         height = resting_height(SMOKE.robot, leg_q)
         data.qpos[:] = [0, 0, height, 1, 0, 0, 0, *robot.default_q]
         data.qpos[7:15] += leg_q

@@ -12,9 +12,9 @@ from wbc_bench.errors import SourceError, UnknownNameError
 from wbc_bench.robot import RobotConfig
 from wbc_bench.rotations import geodesic_angle, matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 from wbc_bench.sources import FRAMES, Seen, StampedTarget, from_world, load_source, to_world
-from wbc_bench.sources.library import SCRIPTS, script_names
 from wbc_bench.sources.live import LiveSource
 from wbc_bench.sources.paths import laps, line, minimum_jerk
+from wbc_bench.sources.registry import SCRIPTS, script_names
 from wbc_bench.sources.scripted import ScriptedSource, load_script
 from wbc_bench.sources.slew import Limits, Pose, slew
 

@@ -20,31 +20,31 @@ from wbc_bench import sources
 from wbc_bench.errors import SourceError
 from wbc_bench.rotations import geodesic_angle, matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 from wbc_bench.sources import StampedTarget, to_world
-from wbc_bench.sources.follower import Follower, Settings, Status
 from wbc_bench.sources.latency import stream_latency
-from wbc_bench.sources.message import MAX_BYTES, Fate
+from wbc_bench.sources.message import MAX_BYTES, MessageStatus
 from wbc_bench.sources.slew import Limits
 from wbc_bench.sources.stream import StreamSource, is_local
+from wbc_bench.sources.stream_filter import Status, StreamConfig, StreamFilter
 
 PERIOD = 0.02  # [s]
 SEEN = seen_at()
 HAND = SEEN.ee_pos_w
-QUICK = Settings(limits=Limits(1e6, 1e6))  # arrives within a step
+QUICK = StreamConfig(limits=Limits(1e6, 1e6))  # arrives within a step
 DOCUMENT = Path(sources.__file__).with_name("STREAM.md")
 
 
 @dataclasses.dataclass
 class Wire:
-    """A follower with clocks that the test sets, and a client that numbers its messages."""
+    """A filter with clocks that the test sets, and a client that numbers its messages."""
 
-    follower: Follower
+    filter: StreamFilter
     now: float = 1000.0  # [s] of both clocks
     time: float = 0.0  # [s] of the episode
     sequence: int = 0
 
     def send(
         self, pos: Sequence[float] | np.ndarray = HAND, rpy=(0.0, 0.0, 0.0), seen=SEEN, **fields
-    ) -> Fate:
+    ) -> MessageStatus:
         self.sequence += 1
         return self.raw(msgspec.msgpack.encode(self.message(pos, rpy) | fields), seen=seen)
 
@@ -53,23 +53,23 @@ class Wire:
         head = {"version": 1, "session": 7, "sequence": self.sequence, "time": self.now, "frame": "world"}
         return head | {"pos": [float(x) for x in pos], "quat_wxyz": quat.tolist()}
 
-    def raw(self, *parts: bytes, seen=SEEN) -> Fate:
-        return self.follower.take(list(parts), seen)
+    def raw(self, *parts: bytes, seen=SEEN) -> MessageStatus:
+        return self.filter.take(list(parts), seen)
 
     def step(self, seconds: float = PERIOD, seen=SEEN) -> tuple[np.ndarray, np.ndarray]:
         """Let time pass; the target in the world then."""
         self.now += seconds
         self.time += seconds
-        return to_world(self.follower.target(self.time, seen), seen)
+        return to_world(self.filter.target(self.time, seen), seen)
 
     @property
     def status(self) -> Status:
-        return self.follower.status
+        return self.filter.status
 
 
-def wire(settings: Settings = QUICK) -> Wire:
-    made = Wire(Follower(settings, lambda: made.now, lambda: made.now))
-    made.follower.reset(SEEN)
+def wire(config: StreamConfig = QUICK) -> Wire:
+    made = Wire(StreamFilter(config, lambda: made.now, lambda: made.now))
+    made.filter.reset(SEEN)
     return made
 
 
@@ -84,7 +84,7 @@ def test_the_latest_wins_and_nothing_moves_before() -> None:
     w = wire()
     np.testing.assert_array_equal(w.step()[0], HAND)
     assert w.status is Status.WAITING
-    assert w.send(offset(x=0.1)) is w.send(offset(x=0.2), rpy=(0.0, 0.3, 0.0)) is Fate.ACCEPTED
+    assert w.send(offset(x=0.1)) is w.send(offset(x=0.2), rpy=(0.0, 0.3, 0.0)) is MessageStatus.ACCEPTED
     pos, rot = w.step()
     np.testing.assert_allclose(pos, offset(x=0.2))
     np.testing.assert_allclose(rot, matrix_from_rpy(np.array([0.0, 0.3, 0.0])), atol=1e-12)
@@ -93,18 +93,18 @@ def test_the_latest_wins_and_nothing_moves_before() -> None:
 
 def test_frames_of_messages() -> None:
     w, seen = wire(), seen_at(0.4, (0.1, 0.2, 0.8))
-    w.follower.reset(seen)
-    assert w.send((0.4, 0.1, 0.3), frame="base", seen=seen) is Fate.ACCEPTED
+    w.filter.reset(seen)
+    assert w.send((0.4, 0.1, 0.3), frame="base", seen=seen) is MessageStatus.ACCEPTED
     np.testing.assert_allclose(w.step(seen=seen)[0], seen.base_pos_w + seen.base_rot_w @ [0.4, 0.1, 0.3])
-    assert w.send((0.4, 0.1, 0.3), frame="arm_mount", seen=seen) is Fate.ACCEPTED
+    assert w.send((0.4, 0.1, 0.3), frame="arm_mount", seen=seen) is MessageStatus.ACCEPTED
     np.testing.assert_allclose(w.step(seen=seen)[0], seen.base_pos_w + seen.base_rot_w @ [0.42, 0.1, 0.33])
 
 
 def test_no_faster_than_the_limits() -> None:
     """0.3 m away at 0.2 m/s: 1.5 s, in steps of 4 mm."""
-    w, before = wire(Settings(limits=Limits(0.2, 0.5))), HAND
+    w, before = wire(StreamConfig(limits=Limits(0.2, 0.5))), HAND
     for k in range(1, 80):
-        assert w.send(offset(y=0.3), rpy=(0.0, 0.0, 1.0)) is Fate.ACCEPTED
+        assert w.send(offset(y=0.3), rpy=(0.0, 0.0, 1.0)) is MessageStatus.ACCEPTED
         pos, rot = w.step()
         assert np.linalg.norm(pos - before) <= 0.2 * PERIOD + 1e-12
         assert pos[1] == pytest.approx(min(0.3, 0.2 * PERIOD * k))
@@ -118,7 +118,7 @@ def test_no_faster_than_the_limits() -> None:
 def test_relative_motion_anchors_where_it_is_engaged() -> None:
     """The device is somewhere else altogether, turned by 1 rad; only its motion counts."""
     w, there = wire(), np.array([5.0, -3.0, 1.0])
-    assert w.send(there, rpy=(0.0, 0.0, 1.0), relative=True) is Fate.ACCEPTED
+    assert w.send(there, rpy=(0.0, 0.0, 1.0), relative=True) is MessageStatus.ACCEPTED
     pos, rot = w.step()
     np.testing.assert_allclose(pos, HAND)
     np.testing.assert_allclose(rot, np.eye(3), atol=1e-12)
@@ -135,20 +135,20 @@ def test_engaging_again_does_not_jump(how: str) -> None:
     w.send((0.1, 0.0, 0.0), relative=True)
     w.step()
     if how == "clutch":
-        assert w.send((3.0, 0.0, 0.0), relative=True, engaged=False) is Fate.ACCEPTED
+        assert w.send((3.0, 0.0, 0.0), relative=True, engaged=False) is MessageStatus.ACCEPTED
         assert w.status is Status.DISENGAGED
     else:
         w.step(1.0)
         assert w.status is Status.HOLDING
     np.testing.assert_allclose(w.step()[0], offset(x=0.1))
-    assert w.send((3.0, 0.0, 0.0), relative=True) is Fate.ACCEPTED
+    assert w.send((3.0, 0.0, 0.0), relative=True) is MessageStatus.ACCEPTED
     np.testing.assert_allclose(w.step()[0], offset(x=0.1))
     w.send((3.0, 0.0, -0.2), relative=True)
     np.testing.assert_allclose(w.step()[0], offset(x=0.1, z=-0.2))
 
 
 def test_an_absolute_target_rests_while_the_clutch_is_out() -> None:
-    w = wire(Settings(limits=Limits(0.1, 1.0)))
+    w = wire(StreamConfig(limits=Limits(0.1, 1.0)))
     w.send(offset(x=0.3))
     pos, _ = w.step()
     w.send(offset(x=9.0), engaged=False)
@@ -161,7 +161,7 @@ def test_an_absolute_target_rests_while_the_clutch_is_out() -> None:
 
 
 def test_silence_holds_then_retreats() -> None:
-    s = Settings(limits=Limits(0.1, 1.0), retreat=Limits(0.05, 0.4), hold_after=0.2, retreat_after=2.0)
+    s = StreamConfig(limits=Limits(0.1, 1.0), retreat=Limits(0.05, 0.4), hold_after=0.2, retreat_after=2.0)
     w = wire(s)
     w.send(offset(x=0.3))
     moving = [w.step()[0] for _ in range(10)][-1]
@@ -178,7 +178,7 @@ def test_silence_holds_then_retreats() -> None:
         before = pos
     assert w.status is Status.RETREATING
     np.testing.assert_allclose(before, HAND, atol=1e-9)
-    assert w.send(offset(x=0.1)) is Fate.ACCEPTED  # and a message takes over again
+    assert w.send(offset(x=0.1)) is MessageStatus.ACCEPTED  # and a message takes over again
     w.step()
     assert w.status is Status.FOLLOWING
 
@@ -196,52 +196,52 @@ def test_the_safe_pose_goes_with_the_base() -> None:
 # what is refused
 
 
-def refusals() -> Iterator[tuple[str, dict, Fate]]:
+def refusals() -> Iterator[tuple[str, dict, MessageStatus]]:
     nan, inf = math.nan, math.inf
-    yield "nan position", {"pos": [nan, 0.0, 1.0]}, Fate.NOT_FINITE
-    yield "infinite position", {"pos": [0.0, -inf, 1.0]}, Fate.NOT_FINITE
-    yield "nan quaternion", {"quat_wxyz": [nan, 0.0, 0.0, 0.0]}, Fate.NOT_FINITE
-    yield "nan time", {"time": nan}, Fate.NOT_FINITE
-    yield "long quaternion", {"quat_wxyz": [1.0, 0.1, 0.0, 0.0]}, Fate.NOT_UNIT
-    yield "zero quaternion", {"quat_wxyz": [0.0, 0.0, 0.0, 0.0]}, Fate.NOT_UNIT
-    yield "huge quaternion", {"quat_wxyz": [1e308, 1e308, 0.0, 0.0]}, Fate.NOT_UNIT
-    yield "old", {"time": 999.0}, Fate.LATE
-    yield "of the future", {"time": 1001.0}, Fate.EARLY
-    yield "same sequence", {"sequence": 1}, Fate.REPLAYED
-    yield "older sequence", {"sequence": 0}, Fate.REPLAYED
-    yield "another session", {"session": 8}, Fate.OCCUPIED
-    yield "beyond reach", {"pos": [30.0, 0.0, 1.0]}, Fate.FAR
-    yield "a jump", {"pos": [0.39, 0.6, 1.15]}, Fate.FAR
-    yield "a turn", {"quat_wxyz": [0.0, 0.0, 0.0, 1.0]}, Fate.FAR
-    yield "a device at infinity", {"pos": [1e300, 0.0, 0.0], "relative": True}, Fate.FAR
-    yield "huge position", {"pos": [1e308, 1e308, 1e308]}, Fate.FAR
-    yield "two coordinates", {"pos": [0.3, 0.0]}, Fate.MALFORMED
-    yield "text for a number", {"pos": ["0.3", 0.0, 1.0]}, Fate.MALFORMED
-    yield "no frame of ours", {"frame": "camera"}, Fate.MALFORMED
-    yield "another version", {"version": 2}, Fate.MALFORMED
-    yield "negative sequence", {"sequence": -1}, Fate.MALFORMED
-    yield "huge sequence", {"sequence": 2**63}, Fate.MALFORMED
-    yield "a field too many", {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]}, Fate.MALFORMED
-    yield "a number for a truth", {"engaged": 1}, Fate.MALFORMED
+    yield "nan position", {"pos": [nan, 0.0, 1.0]}, MessageStatus.NOT_FINITE
+    yield "infinite position", {"pos": [0.0, -inf, 1.0]}, MessageStatus.NOT_FINITE
+    yield "nan quaternion", {"quat_wxyz": [nan, 0.0, 0.0, 0.0]}, MessageStatus.NOT_FINITE
+    yield "nan time", {"time": nan}, MessageStatus.NOT_FINITE
+    yield "long quaternion", {"quat_wxyz": [1.0, 0.1, 0.0, 0.0]}, MessageStatus.NOT_UNIT
+    yield "zero quaternion", {"quat_wxyz": [0.0, 0.0, 0.0, 0.0]}, MessageStatus.NOT_UNIT
+    yield "huge quaternion", {"quat_wxyz": [1e308, 1e308, 0.0, 0.0]}, MessageStatus.NOT_UNIT
+    yield "old", {"time": 999.0}, MessageStatus.LATE
+    yield "of the future", {"time": 1001.0}, MessageStatus.EARLY
+    yield "same sequence", {"sequence": 1}, MessageStatus.REPLAYED
+    yield "older sequence", {"sequence": 0}, MessageStatus.REPLAYED
+    yield "another session", {"session": 8}, MessageStatus.OCCUPIED
+    yield "beyond reach", {"pos": [30.0, 0.0, 1.0]}, MessageStatus.FAR
+    yield "a jump", {"pos": [0.39, 0.6, 1.15]}, MessageStatus.FAR
+    yield "a turn", {"quat_wxyz": [0.0, 0.0, 0.0, 1.0]}, MessageStatus.FAR
+    yield "a device at infinity", {"pos": [1e300, 0.0, 0.0], "relative": True}, MessageStatus.FAR
+    yield "huge position", {"pos": [1e308, 1e308, 1e308]}, MessageStatus.FAR
+    yield "two coordinates", {"pos": [0.3, 0.0]}, MessageStatus.MALFORMED
+    yield "text for a number", {"pos": ["0.3", 0.0, 1.0]}, MessageStatus.MALFORMED
+    yield "no frame of ours", {"frame": "camera"}, MessageStatus.MALFORMED
+    yield "another version", {"version": 2}, MessageStatus.MALFORMED
+    yield "negative sequence", {"sequence": -1}, MessageStatus.MALFORMED
+    yield "huge sequence", {"sequence": 2**63}, MessageStatus.MALFORMED
+    yield "a field too many", {"quat_xyzw": [0.0, 0.0, 0.0, 1.0]}, MessageStatus.MALFORMED
+    yield "a number for a truth", {"engaged": 1}, MessageStatus.MALFORMED
 
 
 @pytest.mark.parametrize(
-    ("fields", "fate"), [row[1:] for row in refusals()], ids=[row[0] for row in refusals()]
+    ("fields", "status"), [row[1:] for row in refusals()], ids=[row[0] for row in refusals()]
 )
 @pytest.mark.filterwarnings("error")
-def test_refused_messages_change_nothing_but_their_count(fields: dict, fate: Fate) -> None:
+def test_refused_messages_change_nothing_but_their_count(fields: dict, status: MessageStatus) -> None:
     w = wire()
-    assert w.send(offset(x=0.1)) is Fate.ACCEPTED
+    assert w.send(offset(x=0.1)) is MessageStatus.ACCEPTED
     before = w.step(0.0)
     w.sequence += 1
-    assert w.raw(msgspec.msgpack.encode(w.message(offset(x=0.2)) | fields)) is fate
+    assert w.raw(msgspec.msgpack.encode(w.message(offset(x=0.2)) | fields)) is status
     after = w.step(0.0)
     np.testing.assert_array_equal(after[0], before[0])
     np.testing.assert_array_equal(after[1], before[1])
-    expected = dict.fromkeys(map(str, Fate), 0) | {"accepted": 1, str(fate): 1}
-    assert w.follower.counters == expected
+    expected = dict.fromkeys(map(str, MessageStatus), 0) | {"accepted": 1, str(status): 1}
+    assert w.filter.counters == expected
     assert (
-        w.raw(msgspec.msgpack.encode(w.message(offset(x=0.2)))) is Fate.ACCEPTED
+        w.raw(msgspec.msgpack.encode(w.message(offset(x=0.2)))) is MessageStatus.ACCEPTED
     )  # its number is still free
 
 
@@ -263,29 +263,34 @@ def test_bytes_that_are_no_message() -> None:
         [msgspec.msgpack.encode(missing)],
         [msgspec.msgpack.encode([1, 2, 3])],
     ):
-        assert w.raw(*parts) is Fate.MALFORMED
-    assert w.raw(good) is Fate.ACCEPTED
-    assert w.follower.counters["malformed"] == 11
+        assert w.raw(*parts) is MessageStatus.MALFORMED
+    assert w.raw(good) is MessageStatus.ACCEPTED
+    assert w.filter.counters["malformed"] == 11
 
 
 def test_sessions_follow_one_another_and_do_not_come_back() -> None:
     w = wire()
-    assert w.send(session=1) is Fate.ACCEPTED
-    assert w.send(session=2) is Fate.OCCUPIED
+    assert w.send(session=1) is MessageStatus.ACCEPTED
+    assert w.send(session=2) is MessageStatus.OCCUPIED
     w.step(1.0)
-    assert w.send(session=2, sequence=0) is Fate.ACCEPTED  # a client that has started anew counts from zero
+    assert (
+        w.send(session=2, sequence=0) is MessageStatus.ACCEPTED
+    )  # a client that has started anew counts from zero
     w.step(1.0)
-    assert w.send(session=1) is Fate.REPLAYED
-    w.follower.reset(SEEN)  # nor in another episode
-    assert w.send(session=1) is Fate.REPLAYED and w.send(session=2, sequence=0) is Fate.REPLAYED
+    assert w.send(session=1) is MessageStatus.REPLAYED
+    w.filter.reset(SEEN)  # nor in another episode
+    assert (
+        w.send(session=1) is MessageStatus.REPLAYED
+        and w.send(session=2, sequence=0) is MessageStatus.REPLAYED
+    )
 
 
 def test_a_device_that_loses_track_is_not_followed() -> None:
     w = wire()
     w.send((0.0, 0.0, 0.0), relative=True)
-    assert w.send((0.9, 0.0, 0.0), relative=True) is Fate.FAR
+    assert w.send((0.9, 0.0, 0.0), relative=True) is MessageStatus.FAR
     np.testing.assert_allclose(w.step()[0], HAND)
-    assert w.send((0.1, 0.0, 0.0), relative=True) is Fate.ACCEPTED
+    assert w.send((0.1, 0.0, 0.0), relative=True) is MessageStatus.ACCEPTED
     np.testing.assert_allclose(w.step()[0], offset(x=0.1))
 
 
@@ -394,8 +399,8 @@ def test_flipped_bits_never_lead_far() -> None:
         pos, rot = w.step(0.0)
         assert np.isfinite(pos).all() and np.isfinite(rot).all()
         assert np.linalg.norm(pos - SEEN.base_pos_w) <= QUICK.max_distance + 1e-9
-    assert sum(w.follower.counters.values()) == 2000
-    assert w.follower.counters["malformed"] > 500 and w.follower.counters["accepted"] > 100
+    assert sum(w.filter.counters.values()) == 2000
+    assert w.filter.counters["malformed"] > 500 and w.filter.counters["accepted"] > 100
 
 
 # addresses
@@ -471,9 +476,9 @@ def test_the_document_names_every_field_and_every_count() -> None:
     text = DOCUMENT.read_text()
     fields = re.findall(r"^\| `(\w+)` \| (?:int|float|str|3|4|bool)", text, re.MULTILINE)
     assert fields == list(sources.message.Message.__struct_fields__)
-    for fate in Fate:
-        assert f"`{fate}`" in text, fate
-    s = Settings()
+    for status in MessageStatus:
+        assert f"`{status}`" in text, status
+    s = StreamConfig()
     for number in (s.max_age, s.max_lead, s.hold_after, s.max_distance, s.max_jump, s.max_turn, *s.limits):
         assert f"{number:g}" in text, number
 
@@ -494,12 +499,12 @@ def test_nothing_is_unpickled() -> None:
 
 def test_rotations_of_targets_stay_rotations() -> None:
     """Slewing on and on must not shear what it turns."""
-    w = wire(Settings(limits=Limits(0.5, 2.0)))
+    w = wire(StreamConfig(limits=Limits(0.5, 2.0)))
     for k in range(500):
         assert (
             w.send(offset(x=0.1 * math.sin(k / 10)), rpy=(math.sin(k / 20), 0.3, math.cos(k / 15)))
-            is Fate.ACCEPTED
+            is MessageStatus.ACCEPTED
         )
-        target = w.follower.target(PERIOD * (k + 1), SEEN)
+        target = w.filter.target(PERIOD * (k + 1), SEEN)
         rot = matrix_from_wxyz(target.quat_wxyz)
         np.testing.assert_allclose(rot @ rot.T, np.eye(3), atol=1e-12)

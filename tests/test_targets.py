@@ -236,10 +236,10 @@ def test_step_targets_need_a_step(solver: StaticSolver) -> None:
     assert draw.stratum == "step"
     rot = matrix_from_wxyz(draw.quat_w)
     assert classify(solver, draw.pos_w, rot) is None
-    stance = solver.ground_frame_of(draw.witness_qpos)
+    stance = solver.ground_frame_of(draw.feasible_qpos)
     assert targets.step_distance[0] <= np.hypot(stance.x, stance.y) <= targets.step_distance[1]
     assert targets.step_yaw[0] <= stance.yaw <= targets.step_yaw[1]
-    assert solver.violations(draw.witness_qpos) == []
+    assert solver.violations(draw.feasible_qpos) == []
     assert classify(solver, *to_ground_frame(stance, draw.pos_w, rot)) is not None
 
 

@@ -51,7 +51,7 @@ def manifest(replicates: int, episodes: int) -> EpisodeManifest:
         height=np.full(count, 0.9),
         target_pos_w=np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.full(count, 0.9)]),
         target_quat_w=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        witness_qpos=np.full((count, 21), np.nan),
+        feasible_qpos=np.full((count, 21), np.nan),
         base_height=np.full(count, 0.85),
         friction=rng.uniform(0.5, 1.0, count),
         base_mass=rng.uniform(0.0, 1.0, count),

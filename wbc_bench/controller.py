@@ -112,7 +112,7 @@ class Exportable(Protocol):
 
 
 @runtime_checkable
-class ShowsLatent(Protocol):
+class HasLatent(Protocol):
     """A controller that shows what it infers of the robot's dynamics and acts upon, for a picture of it."""
 
     def latent(self) -> Array:
@@ -121,10 +121,10 @@ class ShowsLatent(Protocol):
 
 
 @runtime_checkable
-class PerReplicate(Protocol):
+class SeededFactory(Protocol):
     """A factory whose variants may stand for several controllers, e.g. one training seed a replicate."""
 
-    def of_replicate(self, variant: str, replicate: int) -> str:
+    def variant_for(self, variant: str, replicate: int) -> str:
         """The variant that meets the episodes of one replicate."""
         ...
 

@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 from wbc_bench import provenance
-from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, PerReplicate
+from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, SeededFactory
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
 from wbc_bench.robot import Robot
 
@@ -105,7 +105,7 @@ def spec_of_replicate(spec: str, replicate: int) -> str:
         factory = installed[name].load()
     except ImportError as error:
         raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
-    return f"{name}:{factory.of_replicate(variant, replicate)}" if isinstance(factory, PerReplicate) else spec
+    return f"{name}:{factory.variant_for(variant, replicate)}" if isinstance(factory, SeededFactory) else spec
 
 
 def _load_attribute(module: str, attribute: str):

@@ -41,7 +41,7 @@ class List:
         from wbc_bench.registry import controllers
         from wbc_bench.results.metrics import METRICS
         from wbc_bench.results.store import ResultStore
-        from wbc_bench.sources.library import find_script, script_names
+        from wbc_bench.sources.registry import find_script, script_names
 
         rows = [(name, point.value) for name, point in sorted(controllers().items())]
         print_table(Table("controllers", "Controllers", ("Name", "Comes from"), tuple(rows)))

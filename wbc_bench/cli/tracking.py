@@ -46,8 +46,8 @@ class Track:
         from wbc_bench.registry import load_controller
         from wbc_bench.results.tracking import read_tracks, tracking_table, write_track
         from wbc_bench.robot import load_robot
-        from wbc_bench.sources.library import check_source
         from wbc_bench.sources.live import LIVE
+        from wbc_bench.sources.registry import check_source
 
         for option, given in (("--controller", self.controller), ("--source", self.source)):
             if not given:
@@ -76,7 +76,7 @@ class Track:
         from wbc_bench.evaluation.tracking import facts, track
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
-        from wbc_bench.sources.library import load_source
+        from wbc_bench.sources.registry import load_source
 
         controller = load_controller(spec, load_robot())
         source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ManifestError
 
+# Column of the file for a field of another name: frozen manifests keep their bytes.
+_COLUMNS = {"feasible_qpos": "witness_qpos"}
+
 
 @dataclass(frozen=True)
 class EpisodeManifest:
@@ -25,9 +28,8 @@ class EpisodeManifest:
     height: NDArray[np.float64]  # (M,) [m] nominal target height (reach), else the target's
     target_pos_w: NDArray[np.float64]  # (M, 3) [m]
     target_quat_w: NDArray[np.float64]  # (M, 4) wxyz
-    witness_qpos: NDArray[
-        np.float64
-    ]  # (M, 21) a feasible configuration that reaches the target; NaN if beyond
+    # (M, 21) a feasible configuration that reaches the target; NaN if beyond
+    feasible_qpos: NDArray[np.float64]
     base_height: NDArray[np.float64]  # (M,) [m] at reset: the lower sole touches the ground
     friction: NDArray[np.float64]  # (M,)
     base_mass: NDArray[np.float64]  # (M,) [kg] added
@@ -68,7 +70,7 @@ def write_manifest(manifest: EpisodeManifest, protocol: EvalProtocol, path: Path
             arrays.append(pa.FixedSizeListArray.from_arrays(flat, value.shape[1]))
         else:
             arrays.append(pa.array(value.tolist(), pa.string()) if value.dtype == object else pa.array(value))
-        names.append(field.name)
+        names.append(_column(field.name))
     table = pa.Table.from_arrays(arrays, names=names)
     table = table.replace_schema_metadata({"protocol": protocol.name, "protocol_digest": protocol.digest})
     pq.write_table(table, path, compression="zstd", use_dictionary=False)
@@ -105,9 +107,14 @@ def read_manifest(protocol: EvalProtocol, path: Path) -> tuple[EpisodeManifest, 
         )
     columns = {}
     for field in fields(EpisodeManifest):
-        column = table[field.name].combine_chunks()
+        column = table[_column(field.name)].combine_chunks()
         if pa.types.is_fixed_size_list(column.type):
             columns[field.name] = column.flatten().to_numpy().reshape(-1, column.type.list_size)
         else:
             columns[field.name] = column.to_numpy(zero_copy_only=False)
     return EpisodeManifest(**columns), sha256
+
+
+def _column(field: str) -> str:
+    """Name in the file of a field of the manifest."""
+    return _COLUMNS.get(field, field)

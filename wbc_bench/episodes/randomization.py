@@ -34,7 +34,7 @@ class EpisodeDraws(NamedTuple):
     noise_scale: float
 
 
-def draw(protocol: EvalProtocol, replicate: int, episode: int) -> EpisodeDraws:
+def sample(protocol: EvalProtocol, replicate: int, episode: int) -> EpisodeDraws:
     """The draws of an episode; each depends on the seed, its quantity and the episode, on nothing else."""
 
     def rng(purpose: str) -> np.random.Generator:
@@ -60,7 +60,7 @@ def draw(protocol: EvalProtocol, replicate: int, episode: int) -> EpisodeDraws:
     )
 
 
-def undisturbed(protocol: EvalProtocol, replicate: int, episode: int) -> EpisodeDraws:
+def nominal(protocol: EvalProtocol, replicate: int, episode: int) -> EpisodeDraws:
     """The nominal robot at rest in the default posture, without pushes or noise."""
     return EpisodeDraws(
         base_height=resting_height(protocol.robot, np.zeros(NUM_LEG_JOINTS)),

@@ -8,7 +8,7 @@ import numpy as np
 
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
-from wbc_bench.episodes.randomization import draw, undisturbed
+from wbc_bench.episodes.randomization import nominal, sample
 from wbc_bench.errors import SourceError, UnknownNameError
 
 CONDITIONS = ("nominal", "randomised")
@@ -58,7 +58,7 @@ def _protocol(duration: float, seed: int, base: str = BASE_PROTOCOL) -> EvalProt
 
 
 def _row(protocol: EvalProtocol, condition: str, episode: int = 0) -> EpisodeManifest:
-    draws = (draw if condition == "randomised" else undisturbed)(protocol, 0, episode)
+    draws = (sample if condition == "randomised" else nominal)(protocol, 0, episode)
     columns = {name: np.array([value]) for name, value in draws._asdict().items()}
     labels = {name: np.array([""], dtype=object) for name in ("stratum", "orientation")}
     return EpisodeManifest(
@@ -68,7 +68,7 @@ def _row(protocol: EvalProtocol, condition: str, episode: int = 0) -> EpisodeMan
         height=np.full(1, np.nan),
         target_pos_w=np.full((1, 3), np.nan),
         target_quat_w=np.array([[1.0, 0.0, 0.0, 0.0]]),
-        witness_qpos=np.full((1, 21), np.nan),
+        feasible_qpos=np.full((1, 21), np.nan),
         **labels,
         **columns,
     )

@@ -19,7 +19,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.episodes.randomization import draw, undisturbed
+from wbc_bench.episodes.randomization import nominal, sample
 from wbc_bench.episodes.static_solver import StaticSolver, Witness, static_solver
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class TargetDraw(NamedTuple):
     stratum: str
     pos_w: Array  # (3,) [m]
     quat_w: Array  # (4,) wxyz
-    witness_qpos: Array  # (21,), NaN if none
+    feasible_qpos: Array  # (21,), NaN if none
     attempts: int  # candidates drawn until this one was taken
 
 
@@ -58,8 +58,8 @@ def manifest_row(
     protocol: EvalProtocol, replicate: int, episode: int, target: TargetDraw, **labels
 ) -> dict[str, object]:
     """The columns of one episode: its target, its draws, and what else a kind of target says of it."""
-    nominal = labels.get("condition") == "nominal"
-    draws = (undisturbed if nominal else draw)(protocol, replicate, episode)
+    make = nominal if labels.get("condition") == "nominal" else sample
+    draws = make(protocol, replicate, episode)
     return {
         "replicate": replicate,
         "episode": episode,
@@ -69,7 +69,7 @@ def manifest_row(
         "height": float(target.pos_w[2]),
         "target_pos_w": target.pos_w,
         "target_quat_w": target.quat_w,
-        "witness_qpos": target.witness_qpos,
+        "feasible_qpos": target.feasible_qpos,
         **draws._asdict(),
         **labels,
     }

@@ -109,7 +109,7 @@ def _check_witnesses(protocol: EvalProtocol, manifest: EpisodeManifest) -> Check
     rows = np.flatnonzero(manifest.stratum != BEYOND)
     off = turned = 0.0
     for i in rows:
-        pos, rot = solver.ee_pose(manifest.witness_qpos[i])
+        pos, rot = solver.ee_pose(manifest.feasible_qpos[i])
         off = max(off, float(np.abs(pos - manifest.target_pos_w[i]).max()))
         turned = max(turned, float(geodesic_angle(rot, matrix_from_wxyz(manifest.target_quat_w[i]))))
     ok = off < 1e-4 and turned < 1e-3
@@ -120,7 +120,7 @@ def _check_feasible(protocol: EvalProtocol, sample: EpisodeManifest) -> Check:
     """Constraints by MuJoCo alone, and whether the feet are in place exactly when the stratum says so."""
     solver, wrong = solver_of(protocol), []
     for i in np.flatnonzero(sample.stratum != BEYOND):
-        qpos, label = sample.witness_qpos[i], f"episode {sample.replicate[i]}/{sample.episode[i]}"
+        qpos, label = sample.feasible_qpos[i], f"episode {sample.replicate[i]}/{sample.episode[i]}"
         wrong += [f"{label}: {problem}" for problem in solver.violations(qpos)]
         frame = solver.ground_frame_of(qpos)
         distance = float(np.hypot(frame.x, frame.y))

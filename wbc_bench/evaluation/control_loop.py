@@ -19,10 +19,10 @@ from wbc_bench.robot import NUM_JOINTS, Scene
 RUNNING = ""
 
 
-class Taken(NamedTuple):
+class StepResult(NamedTuple):
     """What happened in one control step."""
 
-    ran: NDArray[np.bool_]  # (N,) episodes that were stepped, those that ended by it included
+    stepped: NDArray[np.bool_]  # (N,) episodes that moved, also those that ended by this step
     q: NDArray[np.float64]  # (N, 14) [rad] commands
     infeasible: NDArray[np.bool_] | None  # (N,) as the controller said
 
@@ -61,7 +61,7 @@ class ControlLoop:
         self.state: State = self.simulation.state()
         self.observation = self.sensors.observe(0, 0.0, self.state, self.active)
 
-    def run(self) -> Iterator[Taken]:
+    def run(self) -> Iterator[StepResult]:
         """Step towards the manifest's targets, until all episodes have ended or their time is up.
 
         Raises: see `advance`.
@@ -79,7 +79,7 @@ class ControlLoop:
         with self._blamed("reset"):
             self._controller.reset(self._rows.episode, self.observation, target)
 
-    def advance(self, target: Target) -> Taken:
+    def advance(self, target: Target) -> StepResult:
         """One control step towards a target.
 
         Raises: ControllerError when the controller fails, or its command has the wrong type or shape.
@@ -101,10 +101,10 @@ class ControlLoop:
         finite = np.isfinite(q).all(axis=1)
         self.ended[active & ~finite] = Outcome.INVALID
         active &= finite
-        taken = Taken(active.copy(), q, command.infeasible)
+        result = StepResult(active.copy(), q, command.infeasible)
         if active.any():
             self._move(q, active)
-        return taken
+        return result
 
     @contextmanager
     def _blamed(self, method: str) -> Iterator[None]:

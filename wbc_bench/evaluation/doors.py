@@ -23,7 +23,7 @@ from wbc_bench.sources.diffusion.demonstrations import Demonstration, write_demo
 from wbc_bench.sources.diffusion.expert import ExpertSource
 from wbc_bench.sources.diffusion.scene import CLOSED, Door, draw_door
 from wbc_bench.sources.interface import SceneSource
-from wbc_bench.sources.library import find_policy
+from wbc_bench.sources.registry import find_policy
 from wbc_bench.sources.slew import Pose
 
 Array = NDArray[np.float64]

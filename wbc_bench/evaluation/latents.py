@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wbc_bench.controller import Controller, ShowsLatent
+from wbc_bench.controller import Controller, HasLatent
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
@@ -15,14 +15,14 @@ def sample_latents(controller: Controller, protocol: EvalProtocol, rows: Episode
 
     Raises: ControllerError, the controller shows no latent or one of the wrong shape.
     """
-    if not isinstance(controller, ShowsLatent):
+    if not isinstance(controller, HasLatent):
         raise ControllerError(
             f"controller '{controller.info.name}' shows no latent: it has no method `latent`"
         )
     loop = ControlLoop(controller, protocol, rows)
     parts = []
     before = loop.state
-    for step, (ran, *_) in enumerate(loop.run()):
+    for step, (stepped, *_) in enumerate(loop.run()):
         error = np.linalg.norm(before.ee_pos_w - rows.target_pos_w, axis=1)  # (N,) [m]
         latent = np.asarray(controller.latent(), dtype=np.float64)
         if latent.ndim != 2 or len(latent) != len(rows):
@@ -30,8 +30,8 @@ def sample_latents(controller: Controller, protocol: EvalProtocol, rows: Episode
                 f"controller '{controller.info.name}' shows a latent of shape {latent.shape}, "
                 f"expected ({len(rows)}, columns)"
             )
-        time = np.full(ran.sum(), step * protocol.control_period)  # [s]
-        parts.append((latent[ran], error[ran], rows.episode[ran], time))
+        time = np.full(stepped.sum(), step * protocol.control_period)  # [s]
+        parts.append((latent[stepped], error[stepped], rows.episode[stepped], time))
         before = loop.state
     latent, error, episode, time = map(np.concatenate, zip(*parts, strict=True))
     return Samples(latent, error, episode, time, precision_below=protocol.success.position)

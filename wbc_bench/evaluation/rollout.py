@@ -18,11 +18,12 @@ def rollout(
     controller: Controller,
     protocol: EvalProtocol,
     rows: EpisodeManifest,
-    watch: Callable[[ControlLoop], None] | None = None,
+    on_step: Callable[[ControlLoop], None] | None = None,
 ) -> EpisodeBatch:
     """Run a controller through the episodes of `rows`, all on this thread.
 
-    `watch` is shown the loop at the start and after every control step; it may read all, and change nothing.
+    `on_step` is called with the loop at the start and after every control step; it may read everything but
+    change nothing.
 
     Raises:
         ControllerError: the control period is not the protocol's, or a command has the wrong shape.
@@ -37,21 +38,21 @@ def rollout(
     steps = np.zeros(count, dtype=np.int64)
     infeasible = np.zeros((count, num_steps), dtype=bool)
 
-    if watch is not None:
-        watch(loop)
-    for step, (ran, q, stuck) in enumerate(loop.run()):
-        if not ran.any():
+    if on_step is not None:
+        on_step(loop)
+    for step, (stepped, q, stuck) in enumerate(loop.run()):
+        if not stepped.any():
             break
-        if watch is not None:
-            watch(loop)
+        if on_step is not None:
+            on_step(loop)
         state = loop.state
-        action[ran, step] = loop.simulation.robot.action_of(q[ran])
+        action[stepped, step] = loop.simulation.robot.action_of(q[stepped])
         if stuck is not None:
             infeasible[:, step] = stuck
-        steps[ran] += 1
-        position_error[ran, step] = np.linalg.norm(state.ee_pos_w - rows.target_pos_w, axis=1)[ran]
-        orientation_error[ran, step] = geodesic_angle(state.ee_rot_w, target_rot_w)[ran]
-        ee_pos_w[ran, step] = state.ee_pos_w[ran]
+        steps[stepped] += 1
+        position_error[stepped, step] = np.linalg.norm(state.ee_pos_w - rows.target_pos_w, axis=1)[stepped]
+        orientation_error[stepped, step] = geodesic_angle(state.ee_rot_w, target_rot_w)[stepped]
+        ee_pos_w[stepped, step] = state.ee_pos_w[stepped]
 
     window = protocol.window_steps
     inside = (position_error < protocol.success.position) & (orientation_error < protocol.success.orientation)
@@ -74,12 +75,12 @@ def _classify(
 ) -> NDArray[np.object_]:
     """The outcome of each episode, (N,), from how it ended and its (N, T) steps inside the tolerance."""
     outcome = ended.copy()
-    stood = ended == RUNNING
+    not_terminated = ended == RUNNING
     held = inside[:, -window:].all(axis=1)
     reached = inside.any(axis=1)
     stuck = infeasible[:, -window:].any(axis=1)
-    outcome[stood] = Outcome.MISSED
-    outcome[stood & reached] = Outcome.DRIFTED
-    outcome[stood & stuck] = Outcome.QP_INFEASIBLE
-    outcome[stood & held] = Outcome.SUCCESS
+    outcome[not_terminated] = Outcome.MISSED
+    outcome[not_terminated & reached] = Outcome.DRIFTED
+    outcome[not_terminated & stuck] = Outcome.QP_INFEASIBLE
+    outcome[not_terminated & held] = Outcome.SUCCESS
     return outcome

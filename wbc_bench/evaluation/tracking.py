@@ -20,7 +20,7 @@ from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
-from wbc_bench.sources.player import PlayedStream
+from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import ScriptedSource
 
 Array = NDArray[np.float64]
@@ -60,11 +60,11 @@ def follow(
     source: Source,
     protocol: EvalProtocol,
     row: EpisodeManifest,
-    watch: Callable[[Moment], None] = lambda moment: None,
+    on_step: Callable[[Moment], None] = lambda moment: None,
 ) -> Tracked:
     """The series of one episode (a manifest of one row, whose target nobody looks at).
 
-    `watch` is told of every control step that was taken.
+    `on_step` is called after every control step that was taken.
     """
     period = protocol.control_period
     furnished = source if isinstance(source, SceneSource) else None
@@ -84,9 +84,9 @@ def follow(
         target = target_in_base(loop.state, pos_w[None], rot_w[None])
         if step == 0:
             loop.reset(target)
-        if not loop.advance(target).ran.any():
+        if not loop.advance(target).stepped.any():
             break
-        watch(Moment(seen, pos_w, rot_w, scenery))
+        on_step(Moment(seen, pos_w, rot_w, scenery))
         series.add(pos_w, rot_w, seen.ee_pos_w, seen.ee_rot_w)
         if not loop.active.any():
             break
@@ -113,7 +113,7 @@ def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
 
 def natural_duration(source: Source) -> float:
     """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources."""
-    script = source.script if isinstance(source, ScriptedSource | PlayedStream) else None
+    script = source.script if isinstance(source, ScriptedSource | ReplayedStream) else None
     if script is None:
         return UNSCRIPTED
     protocol = _protocol(UNSCRIPTED, seed=0)
@@ -125,7 +125,7 @@ def natural_duration(source: Source) -> float:
 
 def _digest(source: Source) -> str | None:
     """SHA-256 of the script or the policy that decides the targets."""
-    if isinstance(source, ScriptedSource | PlayedStream):
+    if isinstance(source, ScriptedSource | ReplayedStream):
         return source.script.digest
     return source.digest if isinstance(source, SceneSource) else None
 

@@ -64,8 +64,8 @@ def _ages(source: StreamSource, period: float, seconds: float) -> tuple[np.ndarr
         step += 1
         time.sleep(max(0.0, start + step * period - time.monotonic()))
         source.target(step * period, SEEN)
-        if not np.isnan(source.follower.latency):
-            ages.append(source.follower.latency)
+        if not np.isnan(source.filter.latency):
+            ages.append(source.filter.latency)
     return np.array(ages), _refused(source) - before
 
 

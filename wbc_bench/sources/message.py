@@ -15,7 +15,7 @@ MAX_POSITION = 100.0  # [m] from any origin; far beyond it the motion of a devic
 Natural = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 
 
-class Fate(enum.StrEnum):
+class MessageStatus(enum.StrEnum):
     """What became of a message; each has exactly one, so that counts add up to the messages received."""
 
     ACCEPTED = "accepted"
@@ -69,18 +69,18 @@ def encode(
     return msgspec.msgpack.encode(message)
 
 
-def decode(parts: list[bytes]) -> Message | Fate:
+def decode(parts: list[bytes]) -> Message | MessageStatus:
     """The message in the parts of one transmission, or why it is none. Never raises."""
     if len(parts) != 1 or len(parts[0]) > MAX_BYTES:
-        return Fate.MALFORMED
+        return MessageStatus.MALFORMED
     try:
         message = _DECODER.decode(parts[0])
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError):
-        return Fate.MALFORMED
+        return MessageStatus.MALFORMED
     if not all(map(math.isfinite, (message.time, *message.pos, *message.quat_wxyz))):
-        return Fate.NOT_FINITE
+        return MessageStatus.NOT_FINITE
     try:
         unit(np.array(message.quat_wxyz))
     except SourceError:
-        return Fate.NOT_UNIT
-    return Fate.FAR if max(map(abs, message.pos)) > MAX_POSITION else message
+        return MessageStatus.NOT_UNIT
+    return MessageStatus.FAR if max(map(abs, message.pos)) > MAX_POSITION else message

@@ -4,8 +4,8 @@ import ipaddress
 from collections.abc import Mapping
 
 from wbc_bench.errors import SourceError
-from wbc_bench.sources.follower import Follower, Settings, Status
 from wbc_bench.sources.interface import Seen, StampedTarget
+from wbc_bench.sources.stream_filter import Status, StreamConfig, StreamFilter
 
 ADDRESS = "tcp://127.0.0.1:5601"
 MAX_DRAIN = 5000  # transmissions taken in at once: a flood must not stop the control loop
@@ -42,12 +42,12 @@ class StreamSource:
     def __init__(
         self,
         address: str = ADDRESS,
-        settings: Settings = Settings(),  # noqa: B008  (immutable)
+        config: StreamConfig = StreamConfig(),  # noqa: B008  (immutable)
         allow_remote: bool = False,
     ) -> None:
         """Raises: SourceError when pyzmq is missing, or the address is not local, not valid, or in use."""
         self.name = "stream"
-        self.follower = Follower(settings)
+        self.filter = StreamFilter(config)
         if not has_port(address):
             raise SourceError(
                 f"stream address '{address}' has no port, valid: 0 to 65535, or * for a free one"
@@ -76,16 +76,16 @@ class StreamSource:
     @property
     def counters(self) -> Mapping[str, int]:
         """Messages by what became of them."""
-        return self.follower.counters
+        return self.filter.counters
 
     @property
     def status(self) -> Status:
         """What the target is doing."""
-        return self.follower.status
+        return self.filter.status
 
     def reset(self, seen: Seen) -> None:
         """Begin where the hand is."""
-        self.follower.reset(seen)
+        self.filter.reset(seen)
 
     def target(self, time: float, seen: Seen) -> StampedTarget:
         """Take in what has come, then say where the target is at `time` [s]."""
@@ -94,8 +94,8 @@ class StreamSource:
                 parts = self._socket.recv_multipart(self._zmq.NOBLOCK)
             except self._zmq.Again:
                 break
-            self.follower.take(parts, seen)
-        return self.follower.target(time, seen)
+            self.filter.take(parts, seen)
+        return self.filter.target(time, seen)
 
     def close(self) -> None:
         """Free the address."""

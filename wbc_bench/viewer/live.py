@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from wbc_bench.errors import BenchError
-from wbc_bench.robot import Scene as Surroundings
+from wbc_bench.robot import Scene
 from wbc_bench.viewer.moment import Moment
 from wbc_bench.viewer.panel import Panel
-from wbc_bench.viewer.scene import Scene, serving
+from wbc_bench.viewer.scene import SceneView, serving
 from wbc_bench.viewer.session import Session, hand_pose
 
 DRAW_PERIOD, PANEL_PERIOD = 0.04, 0.25  # [s]
@@ -31,7 +31,7 @@ class LiveView:
         self.session = session
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.paused, self.waiting, self.speed = False, False, 1.0
-        self.scene = Scene(server, session.robot, session.protocol.success, TRAIL_PIECES)
+        self.scene = SceneView(server, session.robot, session.protocol.success, TRAIL_PIECES)
         self.gizmo = server.scene.add_transform_controls(
             "/goal", scale=GIZMO, line_width=4.0, depth_test=False
         )
@@ -39,7 +39,7 @@ class LiveView:
         self.gizmo.on_update(lambda _: self._goal_moved())
         self._pace: deque[tuple[float, float]] = deque(maxlen=100)  # (wall, simulated) [s]
         self._drawn: Moment | None = None
-        self._surroundings: Surroundings | None = None
+        self._surroundings: Scene | None = None
         self._begin()
 
     # what the page asks for, from its threads

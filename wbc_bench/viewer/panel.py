@@ -1,7 +1,8 @@
 """What stands beside the scene of the live view: read-outs, charts and controls."""
 
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -10,19 +11,46 @@ from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, rpy_from_matrix, wxyz_from_matrix
 from wbc_bench.sources import source_names
 from wbc_bench.viewer.moment import Array, Moment
-
-if TYPE_CHECKING:
-    from wbc_bench.viewer.live import LiveView
+from wbc_bench.viewer.session import Session
 
 CHART_SECONDS, CHART_EVERY = 10.0, 5  # [s], control steps a point
 POSITION_COLOUR, ORIENTATION_COLOUR = "#2864c8", "#b0446e"
 PUSHES = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}  # world x, y
 
 
+class Controllable(Protocol):
+    """The part of a live view that the panel shows and operates; `live.LiveView` implements it."""
+
+    session: Session
+    paused: bool
+    speed: float  # simulated by elapsed time
+
+    @property
+    def doing(self) -> str:
+        """The state of the view in a few words."""
+        ...
+
+    def ask(self, command: Callable[[], None]) -> None:
+        """Let a command run between two control steps."""
+        ...
+
+    def set_goal(self, pos_w: Array, wxyz: Array) -> None:
+        """Move the goal to a position (3,) [m] and quaternion (4,) in the world frame."""
+        ...
+
+    def restart(self, spec: str | None = None, source: str | None = None) -> None:
+        """Begin a new episode, with another controller or source where one is given."""
+        ...
+
+    def step_once(self) -> None:
+        """Pause, and take one control step."""
+        ...
+
+
 class Panel:
     """Shows a view, and asks it for what a person wants."""
 
-    def __init__(self, server: Any, view: "LiveView") -> None:
+    def __init__(self, server: Any, view: Controllable) -> None:
         self._view, gui = view, server.gui
         session = view.session
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(40, 100, 200))

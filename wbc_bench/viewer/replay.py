@@ -10,7 +10,7 @@ from wbc_bench.files import write_atomic
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.results.store import Run
 from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress, rerun
-from wbc_bench.viewer.scene import Scene, serving
+from wbc_bench.viewer.scene import SceneView, serving
 
 CHART = (370, 48)  # [px] width, height of the error chart
 
@@ -34,7 +34,7 @@ def write_html(
 def page(again: Rerun) -> str:
     """The page of an episode."""
     with serving() as server:
-        scene = Scene(server, again.robot, again.protocol.success)
+        scene = SceneView(server, again.robot, again.protocol.success)
         moments = again.moments[::EVERY]
         scene.show(moments[0])
         recording = server.get_scene_serializer()

@@ -131,14 +131,14 @@ def _watched(
     push_vel = rows.push_vel[row].reshape(-1, 2)
     moments: list[Moment] = []
 
-    def watch(loop: ControlLoop) -> None:
+    def on_step(loop: ControlLoop) -> None:
         since = loop.step * loop.period - push_time  # [s]
         pushed = push_vel[(since > 0) & (since <= PUSH_SECONDS)].sum(axis=0)
         moments.append(moment_of(loop, row, pos_w, rot_w, pushed))
         if progress is not None:
             progress(loop.step, protocol.num_steps, "running the episode again")
 
-    batch = rollout(load_controller(spec, robot), protocol, rows, watch)
+    batch = rollout(load_controller(spec, robot), protocol, rows, on_step)
     seen = moments[: int(batch.steps[row]) + 1]
     return [moment for moment in seen if np.isfinite(moment.qpos).all()], episode_table(rows, batch)
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from wbc_bench.episodes.protocol import Success
 from wbc_bench.errors import BenchError
-from wbc_bench.robot import Robot
-from wbc_bench.robot import Scene as Surroundings
+from wbc_bench.robot import Robot, Scene
 from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 
@@ -54,7 +53,7 @@ def serving(host: str = "127.0.0.1", port: int = 8080) -> Iterator[Any]:
             server.stop()
 
 
-class Scene:
+class SceneView:
     """Draws moments of one robot; `success` says when the hand is at its target."""
 
     def __init__(self, server: Any, robot: Robot, success: Success, trail_chunks: int | None = None) -> None:
@@ -93,7 +92,7 @@ class Scene:
             _Trail(scene, "/trail_target", TARGET, trail_chunks),
         )
 
-    def furnish(self, surroundings: Surroundings | None) -> None:
+    def furnish(self, surroundings: Scene | None) -> None:
         """Draw the robot in its surroundings from now on, or on bare ground."""
         for part in self._parts:
             part.remove()

@@ -109,7 +109,7 @@ class Session:
         """One control step towards the target of the source; nothing when it is over."""
         if not self.running:
             return
-        if self._loop.advance(self._target()).ran.any():
+        if self._loop.advance(self._target()).stepped.any():
             self._series.add(self._pos_w, self._rot_w, self._seen.ee_pos_w, self._seen.ee_rot_w)
         self._seen = seen_of(self._loop.state, self.robot)
         self._look()

@@ -7,12 +7,12 @@ feed-forward and feedback: what is left is the whole-body IK alone) and
 
 from dataclasses import replace
 
+from wbc_baselines.ik.config import TUNED
 from wbc_baselines.ik.controller import PERIOD, IKController
-from wbc_baselines.ik.settings import TUNED
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.robot import Robot
 
-CHANGES: dict[str, dict[str, bool]] = {  # of the settings
+CHANGES: dict[str, dict[str, bool]] = {  # to the tuned configuration
     "": {},
     "kinematic": {"feedforward": False, "feedback": False, "stepping": False},
     "osqp": {},
@@ -25,11 +25,11 @@ def make(robot: Robot, variant: str = "") -> IKController:
     """The controller of a variant. Raises: UnknownNameError."""
     if variant not in VARIANTS:
         raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
-    settings = replace(TUNED, **CHANGES[variant])
+    config = replace(TUNED, **CHANGES[variant])
     # imported here: each solver is needed only by its own variant
     if variant == "osqp":
         from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
     else:
         from wbc_baselines.ik.placo_ik import PlacoIK as Solver
     name = f"ik:{variant}" if variant else "ik"
-    return IKController(robot, Solver(robot, settings.weights, PERIOD), settings, name)
+    return IKController(robot, Solver(robot, config.weights, PERIOD), config, name)

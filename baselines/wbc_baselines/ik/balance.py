@@ -13,7 +13,9 @@ def friction_rays(friction: float) -> Array:
     return np.array([(m, m, 1.0), (m, -m, 1.0), (-m, m, 1.0), (-m, -m, 1.0)])
 
 
-def distribute(points: Array, rays: Array, wrench: Array, weight: Array, damping: float) -> Array:
+def distribute_contact_forces(
+    points: Array, rays: Array, wrench: Array, weight: Array, damping: float
+) -> Array:
     """Forces (P, 3) [N] at points (P, 3) [m], relative to the centre of mass, that come closest to a wrench.
 
     wrench: (6,) force [N] over moment [N m] about the centre of mass; weight: (6,) on its rows. Minimises

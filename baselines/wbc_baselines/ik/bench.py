@@ -17,10 +17,10 @@ import pinocchio as pin
 import qpsolvers
 from numpy.typing import NDArray
 
+from wbc_baselines.ik.config import TUNED, Weights
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
-from wbc_baselines.ik.settings import TUNED, Weights
 from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
@@ -29,12 +29,12 @@ from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
 
 Array = NDArray[np.float64]
 PERIOD = 0.02  # [s]
-SLEW = 35  # steps until the target has arrived, as in `reference.plan`
+SLEW = 35  # steps until the target has arrived, as in `reference.plan_goal_posture`
 POSITION_AND_PITCH = [0, 1, 2, 4]  # of a foot's twist in its own frame
 QP_SOLVERS = ("daqp", "quadprog", "proxqp", "osqp")  # for Pink and mink: the fastest here first
 
 
-class Scene(NamedTuple):
+class BenchProblem(NamedTuple):
     """What stays the same in all steps: the robot stands in its default posture on flat ground."""
 
     robot: Robot
@@ -66,8 +66,8 @@ class Solver(Protocol):
 class Ours:
     """A solver of this package."""
 
-    def __init__(self, ik: PlacoIK | OsqpIK, package: str, qp: str, scene: Scene) -> None:
-        self._ik, self._scene = ik, scene
+    def __init__(self, ik: PlacoIK | OsqpIK, package: str, qp: str, problem: BenchProblem) -> None:
+        self._ik, self._problem = ik, problem
         self.package, self.qp = package, qp
 
     def start(self, q: Array) -> Array:
@@ -76,32 +76,32 @@ class Ours:
     to_pinocchio = start
 
     def step(self, q: Array, ee: Pose) -> Array | None:
-        scene = self._scene
-        default, weight = scene.robot.default_q, scene.weights.planning_posture
-        return self._ik.step(q, ee, scene.soles, scene.hull, default, weight)
+        problem = self._problem
+        default, weight = problem.robot.default_q, problem.weights.planning_posture
+        return self._ik.step(q, ee, problem.soles, problem.hull, default, weight)
 
 
-def make_placo(scene: Scene) -> Solver:
-    return Ours(PlacoIK(scene.robot, scene.weights, PERIOD), "placo", "eiquadprog", scene)
+def make_placo(problem: BenchProblem) -> Solver:
+    return Ours(PlacoIK(problem.robot, problem.weights, PERIOD), "placo", "eiquadprog", problem)
 
 
-def make_osqp(scene: Scene) -> Solver:
-    return Ours(OsqpIK(scene.robot, scene.weights, PERIOD), "osqp", "osqp", scene)
+def make_osqp(problem: BenchProblem) -> Solver:
+    return Ours(OsqpIK(problem.robot, problem.weights, PERIOD), "osqp", "osqp", problem)
 
 
-def make_pink(scene: Scene) -> Solver:
+def make_pink(problem: BenchProblem) -> Solver:
     """Raises: ImportError: Pink is not installed."""
     import pink  # pyright: ignore[reportMissingImports]
     from pink.limits import ConfigurationLimit, Limit, VelocityLimit  # pyright: ignore[reportMissingImports]
     from pink.tasks import ComTask, FrameTask, PostureTask  # pyright: ignore[reportMissingImports]
 
-    robot, weights = scene.robot, scene.weights
+    robot, weights = problem.robot, problem.weights
     model = WholeBodyModel(robot).model
     model.lowerPositionLimit[7:] = robot.lower + weights.joint_margin
     model.upperPositionLimit[7:] = robot.upper - weights.joint_margin
     model.velocityLimit[:6] = np.inf
     model.velocityLimit[6:] = weights.speed_fraction * robot.velocity
-    normal, offset = half_planes(scene.hull)
+    normal, offset = half_planes(problem.hull)
     clearance = Clearance(robot, model, weights.collision_trigger)
 
     class PositionPitchTask(FrameTask):
@@ -126,7 +126,7 @@ def make_pink(scene: Scene) -> Solver:
         package, qp = "pin-pink", _qp_solver()
 
         def __init__(self) -> None:
-            self._configuration = pink.Configuration(model, model.createData(), scene.q)
+            self._configuration = pink.Configuration(model, model.createData(), problem.q)
             self._ee = FrameTask("tcp", np.sqrt(weights.ee_position), np.sqrt(weights.ee_orientation))
             left, right = FrameTask("sole_L", 1.0, 1.0), PositionPitchTask("sole_R", 1.0, 1.0)
             flat = FrameTask("sole_R", 0.0, np.sqrt(weights.foot_flat))
@@ -134,10 +134,10 @@ def make_pink(scene: Scene) -> Solver:
             upright.set_target(pin.SE3.Identity())
             com = ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
             posture = PostureTask(float(np.sqrt(weights.planning_posture)))
-            for task, (pos, rot) in zip((left, right, flat), [*scene.soles, scene.soles[1]], strict=True):
+            for task, (pos, rot) in zip((left, right, flat), [*problem.soles, problem.soles[1]], strict=True):
                 task.set_target(pin.SE3(rot, pos))
-            com.set_target(np.array([*scene.hull.mean(axis=0), 0.0]))
-            posture.set_target(scene.q)
+            com.set_target(np.array([*problem.hull.mean(axis=0), 0.0]))
+            posture.set_target(problem.q)
             self._tasks, self._hard = [self._ee, flat, upright, com, posture], [left, right]
             self._limits = [
                 ConfigurationLimit(model, 1.0),
@@ -172,14 +172,14 @@ def make_pink(scene: Scene) -> Solver:
     return Pink()
 
 
-def make_mink(scene: Scene) -> Solver:
+def make_mink(problem: BenchProblem) -> Solver:
     """Raises: ImportError: mink is not installed."""
     import mink  # pyright: ignore[reportMissingImports]
     import mujoco
 
-    robot, weights = scene.robot, scene.weights
+    robot, weights = problem.robot, problem.weights
     model = robot.model()
-    normal, offset = half_planes(scene.hull)
+    normal, offset = half_planes(problem.hull)
 
     class PositionPitchTask(mink.FrameTask):
         def compute_error(self, configuration):
@@ -209,10 +209,10 @@ def make_mink(scene: Scene) -> Solver:
             upright.set_target(mink.SE3.identity())
             com = mink.ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
             posture = mink.PostureTask(model, float(np.sqrt(weights.planning_posture)))
-            for task, pose in zip((left, right, flat), [*scene.soles, scene.soles[1]], strict=True):
+            for task, pose in zip((left, right, flat), [*problem.soles, problem.soles[1]], strict=True):
                 task.set_target(_se3(pose))
-            com.set_target(np.array([*scene.hull.mean(axis=0), 0.0]))
-            posture.set_target(self.start(scene.q))
+            com.set_target(np.array([*problem.hull.mean(axis=0), 0.0]))
+            posture.set_target(self.start(problem.q))
             self._tasks, self._hard = [self._ee, flat, upright, com, posture], [left, right]
             speed = weights.speed_fraction * robot.velocity
             self._limits = [
@@ -261,7 +261,7 @@ def make_mink(scene: Scene) -> Solver:
     return Mink()
 
 
-MAKERS: dict[str, Callable[[Scene], Solver]] = {
+MAKERS: dict[str, Callable[[BenchProblem], Solver]] = {
     "placo": make_placo,
     "osqp": make_osqp,
     "pin-pink": make_pink,
@@ -285,29 +285,29 @@ def ik_solve_times(targets: int = 20, steps: int = 60) -> pd.DataFrame:
     and goes meets all of them. Errors are those of the last configuration: the median of the hand, the worst
     sole. A package that is not installed is a row that says so.
     """
-    scene = _scene()
+    problem = _problem()
     solvers, rows = {}, {}
     for name, make in MAKERS.items():
         try:
-            solvers[name] = make(scene)
+            solvers[name] = make(problem)
         except ImportError as error:
             rows[name] = {"package": name, "note": f"{error}: pip install 'wbc-bench[bench]'"}
-    goals = _goals(scene, targets)
+    goals = _goals(problem, targets)
     walks = {name: [] for name in solvers}
     for goal in [goals[0], *goals]:
         for name, solver in solvers.items():
-            walks[name].append(_walk(scene, solver, goal, steps))
+            walks[name].append(_walk(problem, solver, goal, steps))
     rows |= {name: _row(name, solvers[name].qp, walks[name][1:]) for name in solvers}  # the first warmed up
     for name in solvers:
         rows[name]["times placo"] = rows[name]["median [ms]"] / rows["placo"]["median [ms]"]
     return pd.DataFrame([rows[name] for name in MAKERS])
 
 
-def _walk(scene: Scene, solver: Solver, goal: Pose, steps: int) -> Walk:
-    model = WholeBodyModel(scene.robot)
-    start = model.ee_of(scene.q)
+def _walk(problem: BenchProblem, solver: Solver, goal: Pose, steps: int) -> Walk:
+    model = WholeBodyModel(problem.robot)
+    start = model.ee_of(problem.q)
     turning = pin.log3(start[1].T @ goal[1])
-    q, times, failed = solver.start(scene.q), [], 0
+    q, times, failed = solver.start(problem.q), [], 0
     for k in range(steps):
         part = min(1.0, (k + 1) / SLEW)
         ee = start[0] + part * (goal[0] - start[0]), start[1] @ pin.exp3(part * turning)
@@ -318,7 +318,7 @@ def _walk(scene: Scene, solver: Solver, goal: Pose, steps: int) -> Walk:
             failed += 1
         else:
             q = found
-    return Walk(times, failed, _errors(model, solver.to_pinocchio(q), goal, scene.soles))
+    return Walk(times, failed, _errors(model, solver.to_pinocchio(q), goal, problem.soles))
 
 
 def _row(name: str, qp: str, walks: list[Walk]) -> dict:
@@ -339,21 +339,21 @@ def _row(name: str, qp: str, walks: list[Walk]) -> dict:
     }
 
 
-def _scene() -> Scene:
+def _problem() -> BenchProblem:
     robot = load_robot()
     model = WholeBodyModel(robot)
     soles_b = model.soles_in_base(robot.default_q)
     pos, rot = base_from_stance(soles_b, np.array([0.0, 0.0, 1.0]), None)
     stance = measured_stance([(pos + rot @ p, rot @ r) for p, r in soles_b])
     q = configuration(pos, rot, robot.default_q)
-    return Scene(robot, TUNED.weights, q, stance.poses(), stance.hull(model.corners))
+    return BenchProblem(robot, TUNED.weights, q, stance.poses(), stance.hull(model.corners))
 
 
-def _goals(scene: Scene, count: int) -> list[Pose]:
+def _goals(problem: BenchProblem, count: int) -> list[Pose]:
     protocol, path = find_protocol("tuning_nominal_v1")
     manifest, _ = read_manifest(protocol, manifest_path(path))
     rows = np.flatnonzero(np.isin(manifest.stratum.astype(str), ("arm", "posture")))[:count]
-    shift = np.array([*scene.q[:2], 0.0])  # the base stands over the world's origin at reset
+    shift = np.array([*problem.q[:2], 0.0])  # the base stands over the world's origin at reset
     return [(manifest.target_pos_w[i] + shift, matrix_from_wxyz(manifest.target_quat_w[i])) for i in rows]
 
 

@@ -4,14 +4,21 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.balance import distribute, friction_rays
+from wbc_baselines.ik.arm_servo import solve_arm
+from wbc_baselines.ik.balance import distribute_contact_forces, friction_rays
+from wbc_baselines.ik.config import IKConfig
 from wbc_baselines.ik.estimation import ComFilter, GravityFilter, JointFilter
-from wbc_baselines.ik.hand import solve_arm
 from wbc_baselines.ik.model import GRAVITY, Pose, WholeBodyModel, configuration, leg_of
-from wbc_baselines.ik.reference import Reference, plan
-from wbc_baselines.ik.settings import Settings
+from wbc_baselines.ik.reference import Reference, plan_goal_posture
 from wbc_baselines.ik.stance import Stance, base_from_sole, base_from_stance, measured_stance, yaw_matrix
-from wbc_baselines.ik.stepping import Swing, choose, landing, outside, pressure, solve_leg
+from wbc_baselines.ik.stepping import (
+    Swing,
+    center_of_pressure,
+    choose_swing_foot,
+    outside,
+    plan_foothold,
+    solve_leg,
+)
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
@@ -41,11 +48,11 @@ class _Episode:
 class IKController:
     """Whole-body IK over the floating base at 50 Hz, anchored to the world by the stance feet alone."""
 
-    def __init__(self, robot: Robot, solver, settings: Settings, name: str = "ik") -> None:
+    def __init__(self, robot: Robot, solver, config: IKConfig, name: str = "ik") -> None:
         self.info = ControllerInfo(name, frozenset({"proprioception"}), PERIOD, "wbc_baselines.ik")
-        self._robot, self._solver, self._s = robot, solver, settings
+        self._robot, self._solver, self._s = robot, solver, config
         self._model = WholeBodyModel(robot)
-        s = settings
+        s = config
         self._joints = JointFilter(PERIOD, s.joint_pos_noise, s.joint_vel_noise, s.joint_acceleration)
         self._gravity = GravityFilter(PERIOD, s.gravity_noise, s.gyro_noise)
         self._rays = friction_rays(s.friction)
@@ -150,7 +157,7 @@ class IKController:
         if s.stepping and e.step * PERIOD > s.step_wait:
             capture, rate = e.com.capture_point()
             if outside(capture, e.hull) > s.step_trigger or self._may_widen(e, capture, rate):
-                side = choose(s, e.stance, capture, rate, model.corners)
+                side = choose_swing_foot(s, e.stance, capture, rate, model.corners)
                 e.swing = Swing(side, s.step_duration, joints[leg_of(side)].copy())
         return True
 
@@ -163,9 +170,9 @@ class IKController:
         # a step swings the hand: one that is at its target already stays there
         if e.stance.width() > s.step_prepare or e.reference.left < s.step_prepare_way:
             return False
-        side = choose(s, e.stance, capture, rate, model.corners)
+        side = choose_swing_foot(s, e.stance, capture, rate, model.corners)
         wider = e.stance.moved(
-            side, landing(s, e.stance, side, capture, rate, s.step_duration, model.corners).xy
+            side, plan_foothold(s, e.stance, side, capture, rate, s.step_duration, model.corners).xy
         )
         _, error = self._plan(e, wider, wider.hull(model.corners))
         return error < s.step_prepare_error
@@ -173,7 +180,9 @@ class IKController:
     def _plan(self, e: _Episode, stance: Stance, hull: Array) -> tuple[Array, float]:
         """Joint positions (14,) at the target on a stance, and the error [m + 0.3 m/rad] left there."""
         way, default, weight = e.reference, self._robot.default_q, self._s.weights.planning_posture
-        return plan(self._solver, self._model, e.q, way.ee, way.target, stance.poses(), hull, default, weight)
+        return plan_goal_posture(
+            self._solver, self._model, e.q, way.ee, way.target, stance.poses(), hull, default, weight
+        )
 
     def _swing(
         self, e: _Episode, swing: Swing, base: Pose, raw: Array, joints: Array, ang_vel_b: Array
@@ -186,9 +195,9 @@ class IKController:
         swing.time += PERIOD
         capture, rate = e.com.capture_point()
         if swing.landing is None or swing.left > s.step_aim:
-            swing.landing = landing(s, e.stance, swing.side, capture, rate, swing.left, model.corners)
+            swing.landing = plan_foothold(s, e.stance, swing.side, capture, rate, swing.left, model.corners)
         # where the base will be when the foot lands
-        p = pressure(capture, e.stance.xy[stand], float(e.stance.yaw[stand]), model.corners)
+        p = center_of_pressure(capture, e.stance.xy[stand], float(e.stance.yaw[stand]), model.corners)
         grow = rate * swing.left
         com = e.com.pos[:2]
         shift = (np.cosh(grow) - 1) * (com - p) + np.sinh(grow) / rate * e.com.vel[:2]
@@ -247,7 +256,7 @@ class IKController:
             wrench[3:] = s.inertia * (s.kp_rot * error - s.kd_rot * (rot @ ang_vel_b) + e.turning)
         arms = [self._contacts @ r.T for _, r in soles]
         points = np.concatenate([p + arm for (p, _), arm in zip(soles, arms, strict=True)]) - e.com.pos
-        forces = distribute(points, self._rays, wrench, self._weight, s.damping)
+        forces = distribute_contact_forces(points, self._rays, wrench, self._weight, s.damping)
         e.acceleration = forces.sum(axis=0) / model.mass
         e.acceleration[2] -= GRAVITY
         for jacobian, arm, force in zip(jacobians, arms, np.split(forces, len(arms)), strict=True):

@@ -11,8 +11,8 @@ import qpsolvers
 from numpy.typing import NDArray
 from scipy import sparse
 
+from wbc_baselines.ik.config import Weights
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel
-from wbc_baselines.ik.settings import Weights
 from wbc_baselines.ik.stance import half_planes
 from wbc_bench.robot import NUM_JOINTS, Robot
 

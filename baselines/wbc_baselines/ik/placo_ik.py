@@ -11,8 +11,8 @@ import numpy as np
 import placo
 from numpy.typing import NDArray
 
+from wbc_baselines.ik.config import Weights
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose
-from wbc_baselines.ik.settings import Weights
 from wbc_bench.robot import JOINT_NAMES, Robot
 
 Array = NDArray[np.float64]

@@ -4,8 +4,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from wbc_baselines.ik.config import IKConfig
 from wbc_baselines.ik.model import Pose, WholeBodyModel, turn
-from wbc_baselines.ik.settings import Settings
 
 Array = NDArray[np.float64]
 # hip, knee, J1, J2, J3 [rad]: squatting, upright, leaning, crouching, arm to either side
@@ -24,8 +24,8 @@ MAX_LEAN = 1.0  # [rad]
 class Reference:
     """Slewed target of one episode in the anchor frame, and the joint posture that goes with it."""
 
-    def __init__(self, settings: Settings, period: float, ee: Pose, target: Pose, posture: Array) -> None:
-        self._s, self._period = settings, period
+    def __init__(self, config: IKConfig, period: float, ee: Pose, target: Pose, posture: Array) -> None:
+        self._s, self._period = config, period
         self.ee = ee  # where the hand should be now
         self.target = target  # filtered
         self.posture = posture  # (14,) [rad] preferred now
@@ -59,7 +59,7 @@ class Reference:
             self.posture = self.goal + (self.left / max(self._way, 1e-9)) * (self._start - self.goal)
 
 
-def plan(
+def plan_goal_posture(
     solver,
     model: WholeBodyModel,
     q: Array,

@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from wbc_baselines.ik.config import IKConfig
 from wbc_baselines.ik.model import Pose, WholeBodyModel, leg_of
-from wbc_baselines.ik.settings import Settings
 from wbc_baselines.ik.stance import Stance, half_planes, yaw_matrix
 
 Array = NDArray[np.float64]
@@ -64,15 +64,15 @@ def outside(point: Array, hull: Array) -> float:
     return float(((point - hull) * normal).sum(axis=1).max())
 
 
-def pressure(point: Array, xy: Array, yaw: float, corners: Array) -> Array:
+def center_of_pressure(point: Array, xy: Array, yaw: float, corners: Array) -> Array:
     """The point (2,) of a sole at `xy`, `yaw` that is nearest to another: where its force acts."""
     rot = yaw_matrix(yaw)[:2, :2]
     inside = np.clip(rot.T @ (point - xy), corners[:, :2].min(axis=0), corners[:, :2].max(axis=0))
     return xy + rot @ inside
 
 
-def landing(
-    s: Settings, stance: Stance, side: int, capture: Array, rate: float, left: float, corners: Array
+def plan_foothold(
+    s: IKConfig, stance: Stance, side: int, capture: Array, rate: float, left: float, corners: Array
 ) -> Landing:
     """Where foot `side` is to land in `left` [s], from the capture point (2,) now.
 
@@ -80,7 +80,7 @@ def landing(
     """
     stand = 1 - side
     xy, yaw = stance.xy[stand], float(stance.yaw[stand])
-    p = pressure(capture, xy, yaw, corners)
+    p = center_of_pressure(capture, xy, yaw, corners)
     rot = yaw_matrix(yaw)[:2, :2]
     ahead = rot.T @ (p + (capture - p) * np.exp(rate * left) - xy)  # (2,) seen from the standing sole
     middle = 0.5 * (corners[:, 0].min() + corners[:, 0].max())
@@ -93,11 +93,11 @@ def landing(
     return Landing(xy + rot @ np.array([reach_x, OUTWARD[side] * reach_y]), float(miss))
 
 
-def choose(s: Settings, stance: Stance, capture: Array, rate: float, corners: Array) -> int:
+def choose_swing_foot(s: IKConfig, stance: Stance, capture: Array, rate: float, corners: Array) -> int:
     """The foot to step with: the one whose landing misses least, then the one that has less far to go."""
     cost = []
     for side in (0, 1):
-        where = landing(s, stance, side, capture, rate, s.step_duration, corners)
+        where = plan_foothold(s, stance, side, capture, rate, s.step_duration, corners)
         cost.append(MISS * where.miss + float(np.linalg.norm(where.xy - stance.xy[side])))
     return int(np.argmin(cost))
 

@@ -17,7 +17,7 @@ class Learned:
 
         return from_checkpoint(robot, variant)
 
-    def of_replicate(self, variant: str, replicate: int) -> str:
+    def variant_for(self, variant: str, replicate: int) -> str:
         """Return `METHOD@k` for `METHOD`; the name of a single checkpoint is returned unchanged."""
         one = "@" in variant or variant.endswith(".safetensors")
         return variant if one else f"{variant}@{replicate}"

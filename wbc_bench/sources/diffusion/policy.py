@@ -31,7 +31,7 @@ HIDDEN = 224  # the largest whose file stays below a megabyte
 CARD = "card"  # the one entry of the file's metadata: the order of several is not determined
 
 
-class Card(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class DoorPolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a policy is and where it comes from."""
 
     format: int
@@ -87,13 +87,13 @@ def look(before: Pose, now: Pose, width: float, door_before: Array, door_now: Ar
     return np.concatenate(views)
 
 
-def save_policy(path: Path, policy: Policy, card: Card) -> None:
+def save_policy(path: Path, policy: Policy, card: DoorPolicyCard) -> None:
     """Write one safetensors file with the card in its metadata. Raises: StoreError."""
     tensors = {name: value.detach().contiguous() for name, value in policy.state_dict().items()}
     write_atomic(path, bytes_of(tensors, metadata={CARD: msgspec.json.encode(card).decode()}))
 
 
-def load_policy(path: Path) -> tuple[Policy, Card, str]:
+def load_policy(path: Path) -> tuple[Policy, DoorPolicyCard, str]:
     """A policy, its card and the SHA-256 of its file.
 
     Raises: SourceError when the file is missing, damaged, no policy, or of another format or size.
@@ -115,7 +115,7 @@ def load_policy(path: Path) -> tuple[Policy, Card, str]:
     return policy.eval(), card, hashlib.sha256(data).hexdigest()
 
 
-def read_card(path: Path) -> Card:
+def read_card(path: Path) -> DoorPolicyCard:
     """The card of a policy's file. Raises: SourceError."""
     if not path.is_file():
         raise SourceError(f"policy '{path}' does not exist")
@@ -127,7 +127,7 @@ def read_card(path: Path) -> Card:
     if text is None:
         raise SourceError(f"policy '{path}' has no card in its metadata: it is of another program")
     try:
-        card = msgspec.json.decode(text, type=Card)
+        card = msgspec.json.decode(text, type=DoorPolicyCard)
     except msgspec.DecodeError as error:
         raise SourceError(f"policy '{path}': card: {error}") from error
     if card.format != FORMAT or not 1 <= card.hidden <= 1 << 12:

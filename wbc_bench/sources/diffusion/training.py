@@ -25,7 +25,7 @@ from wbc_bench.sources.diffusion.policy import (
     HIDDEN,
     HORIZON,
     PERIOD,
-    Card,
+    DoorPolicyCard,
     Policy,
 )
 from wbc_bench.sources.slew import Pose
@@ -132,7 +132,7 @@ def train(
     seed: int,
     updates: int = UPDATES,
     report: Callable[[int, float], None] = lambda update, loss: None,
-) -> tuple[Policy, Card]:
+) -> tuple[Policy, DoorPolicyCard]:
     """The policy of a file of demonstrations, and its card.
 
     Raises: SourceError, the file cannot be used or does not say how often it was recorded.
@@ -147,7 +147,7 @@ def train(
     policy = fit(data, seed, updates, report=report)
     commit = provenance.commit()
     doors: Any = found.attributes.get("seed")
-    return policy, Card(
+    return policy, DoorPolicyCard(
         format=FORMAT,
         seed=seed,
         demonstrations=len(found.episodes),

@@ -228,7 +228,7 @@ def sample_manifest(
         height=pos[:, 2],
         target_pos_w=pos,
         target_quat_w=target_set.quat_w[chosen].astype(np.float64),
-        witness_qpos=np.full((count, 21), np.nan),
+        feasible_qpos=np.full((count, 21), np.nan),
         **{name: column.numpy() for name, column in samples.reset._asdict().items()},
         push_time=np.where(push_step < 0, np.nan, push_step * protocol.control_period),
         push_vel=samples.push_vel.numpy().reshape(count, -1),

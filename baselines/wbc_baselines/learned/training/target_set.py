@@ -75,7 +75,7 @@ def draw_target_set(
 
     def work(start: int) -> list[tuple]:
         draws = [draw_workspace_target(shifted, 0, k) for k in range(start, min(start + CHUNK, count))]
-        return [(STRATA.index(d.stratum), d.pos_w, d.quat_w, d.witness_qpos) for d in draws]
+        return [(STRATA.index(d.stratum), d.pos_w, d.quat_w, d.feasible_qpos) for d in draws]
 
     rows: list[tuple] = []
     parts: Any = Parallel(n_jobs=workers, return_as="generator")(

@@ -8,12 +8,12 @@ from wbc_bench.errors import SourceError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.sources.interface import Source
 from wbc_bench.sources.live import LIVE, LiveSource
-from wbc_bench.sources.player import PlayedStream
+from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
 
 if TYPE_CHECKING:
-    from wbc_bench.sources.diffusion.policy import Card, Policy
+    from wbc_bench.sources.diffusion.policy import DoorPolicyCard, Policy
 
 SCRIPTS = PROTOCOLS / "scripts"
 POLICY = Path(__file__).parent / "diffusion" / "door.safetensors"  # of `diffusion` without a file
@@ -74,11 +74,11 @@ def load_source(
         return StreamSource(address, allow_remote=allow_remote)
     if name.startswith("stream:"):
         script = ScriptedSource(find_script(name.removeprefix("stream:")))
-        return PlayedStream(script, StreamSource(address, allow_remote=allow_remote))
+        return ReplayedStream(script, StreamSource(address, allow_remote=allow_remote))
     return ScriptedSource(find_script(name))
 
 
-def find_policy(file: str = "") -> "tuple[Policy, Card, str]":
+def find_policy(file: str = "") -> "tuple[Policy, DoorPolicyCard, str]":
     """The diffusion policy of a file, by default the packaged one, its card and its SHA-256.
 
     Raises: SourceError when the file is missing or damaged, or torch or safetensors is not installed.

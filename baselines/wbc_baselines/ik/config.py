@@ -30,7 +30,7 @@ class Weights:
 
 
 @dataclass(frozen=True)
-class Settings:
+class IKConfig:
     """Of the controller around the program."""
 
     weights: Weights = field(default_factory=Weights)
@@ -91,4 +91,4 @@ class Settings:
     com_jump: float = 0.3  # [m/s] a push
 
 
-TUNED = Settings()
+TUNED = IKConfig()

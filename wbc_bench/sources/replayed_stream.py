@@ -13,7 +13,7 @@ from wbc_bench.sources.stream import StreamSource
 RATE = 100  # [Hz] of sending
 
 
-class PlayedStream:
+class ReplayedStream:
     """A stream and a client of it on a thread of its own, started at every reset."""
 
     live = True

@@ -9,11 +9,11 @@ import numpy as np
 
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz, wxyz_from_matrix
 from wbc_bench.sources.interface import Frame, Seen, StampedTarget, from_world, to_world
-from wbc_bench.sources.message import Fate, Message, decode
+from wbc_bench.sources.message import Message, MessageStatus, decode
 from wbc_bench.sources.slew import Limits, Pose, slew
 
 
-class Settings(NamedTuple):
+class StreamConfig(NamedTuple):
     """Choices, all of them: slow enough for a person to step in, wide enough for the workspace of the arm."""
 
     limits: Limits = Limits()  # of the target
@@ -42,17 +42,17 @@ class _Goal(NamedTuple):
     pose: Pose
 
 
-class Follower:
+class StreamFilter:
     """The latest good message wins. Silence is measured by when messages come, not by what they say of it."""
 
     def __init__(
         self,
-        settings: Settings = Settings(),  # noqa: B008  (immutable)
+        config: StreamConfig = StreamConfig(),  # noqa: B008  (immutable)
         clock: Callable[[], float] = clocks.monotonic,
         unix_time: Callable[[], float] = clocks.time,
     ) -> None:
-        self._s, self._clock, self._unix_time = settings, clock, unix_time
-        self._counts = dict.fromkeys(Fate, 0)
+        self._s, self._clock, self._unix_time = config, clock, unix_time
+        self._counts = dict.fromkeys(MessageStatus, 0)
         self._session: int | None = None
         self._ended: set[int] = set()
         self._sequence = -1
@@ -64,7 +64,7 @@ class Follower:
     @property
     def counters(self) -> Mapping[str, int]:
         """Messages by what became of them."""
-        return {str(fate): count for fate, count in self._counts.items()}
+        return {str(status): count for status, count in self._counts.items()}
 
     def reset(self, seen: Seen) -> None:
         """Begin where the hand is; messages of the past stay refused."""
@@ -78,12 +78,12 @@ class Follower:
             None  # target and device at engaging, in the message's frame
         )
 
-    def take(self, parts: list[bytes], seen: Seen) -> Fate:
+    def take(self, parts: list[bytes], seen: Seen) -> MessageStatus:
         """Take in one transmission. Only an accepted one changes anything but the counters."""
         message = decode(parts)
-        fate = message if isinstance(message, Fate) else self._judge(message, seen)
-        self._counts[fate] += 1
-        return fate
+        status = message if isinstance(message, MessageStatus) else self._judge(message, seen)
+        self._counts[status] += 1
+        return status
 
     def target(self, time: float, seen: Seen) -> StampedTarget:
         """The target at `time` [s] of the episode."""
@@ -104,27 +104,27 @@ class Follower:
         self.latency, self._sent = self._unix_time() - self._sent, np.nan
         return target
 
-    def _judge(self, message: Message, seen: Seen) -> Fate:
+    def _judge(self, message: Message, seen: Seen) -> MessageStatus:
         s, age = self._s, self._unix_time() - message.time
         if age > s.max_age:
-            return Fate.LATE
+            return MessageStatus.LATE
         if age < -s.max_lead:
-            return Fate.EARLY
+            return MessageStatus.EARLY
         now = self._clock()
         fresh = message.session != self._session
         if message.session in self._ended or (not fresh and message.sequence <= self._sequence):
-            return Fate.REPLAYED
+            return MessageStatus.REPLAYED
         if fresh and now - self._received <= s.hold_after:
-            return Fate.OCCUPIED
+            return MessageStatus.OCCUPIED
         goal, anchor = self._aim(message, self._anchor if not fresh else None, seen)
         if message.engaged and self._far(goal, seen):
-            return Fate.FAR
+            return MessageStatus.FAR
         if fresh and self._session is not None:
             self._ended.add(self._session)
         self._session, self._sequence, self._received = message.session, message.sequence, now
         self._goal, self._anchor, self._sent = goal, anchor, message.time
         self.status = Status.FOLLOWING if message.engaged else Status.DISENGAGED
-        return Fate.ACCEPTED
+        return MessageStatus.ACCEPTED
 
     def _aim(self, message: Message, anchor, seen: Seen) -> tuple[_Goal, tuple[_Goal, Pose] | None]:
         """Where a message leads, and what its motion is measured from."""
