@@ -1,6 +1,7 @@
 """A controller that stands in the default posture and moves one arm joint with the distance of the target."""
 
 import numpy as np
+
 from wbc_bench import ControllerInfo, JointCommand
 
 SHOULDER = 9  # J2 of the arm; `robot.facts.joints` lists the order
