@@ -4,7 +4,7 @@ BENCH := .venv/bin/wbc-bench
 # Episodes of each of the 3 replicates in `make ablation`: minutes on two cores with all four controllers.
 EPISODES ?= 50
 
-.PHONY: ablation ablation-full reach rebuild test lint bench ci
+.PHONY: ablation ablation-full reach rebuild test lint bench docs ci
 
 ablation: .venv/installed  ## live, EPISODES x 3 episodes a controller, into build/ablation
 	$(BENCH) ablation --seeds 3 --episodes $(EPISODES) --out build/ablation
@@ -27,8 +27,11 @@ lint: .venv/installed
 bench: .venv/installed  ## solve time of the IK controller beside other packages
 	$(BENCH) bench
 
+docs: .venv/installed  ## the documentation, into site/
+	.venv/bin/mkdocs build --strict
+
 ci:
 	PYTHON=$(PYTHON) .ci/run
 
 .venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv && .venv/bin/pip install -q -c constraints.txt -e '.[test,bench]' && touch $@
+	$(PYTHON) -m venv .venv && .venv/bin/pip install -q -c constraints.txt -e '.[test,bench,docs]' && touch $@
