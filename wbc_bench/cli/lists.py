@@ -21,9 +21,9 @@ class List:
     """List controllers, protocols, sources, metrics, benchmarks and runs."""
 
     results: Path = Path("results")
-    """Folder of the records."""
+    """Folder to read the records from."""
     inputs: FlagCreatePairsOff[bool] = False
-    """Instead, what stands in which column of the inputs of learned controllers."""
+    """List, instead of all that, which term stands in which column of the inputs of learned controllers."""
 
     def run(self) -> None:
         from importlib.metadata import entry_points
@@ -94,13 +94,13 @@ class ExportController:
     """Write a controller to a file for other runtimes, normalisers, window and recurrent state included."""
 
     controller: str = tyro.MISSING
-    """Controller that can be exported: name:variant."""
+    """Controller to export: name:variant of one that supports it, e.g. learned:METHOD@SEED."""
     format: str = "onnx"
-    """Format of the file."""
+    """Format of the file to write, one that the controller supports."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File to write; named after the controller when not given."""
+    """Path of the file to write; named after the controller when not given."""
     protocol: str = "ablation_v1"
-    """Protocol whose robot it drives."""
+    """Name of the protocol, or path of its .toml file, whose robot the controller drives."""
 
     def run(self) -> None:
         from wbc_bench.controller import Exportable
@@ -125,9 +125,9 @@ class Bench:
     """Time what the installed packages offer to be timed, e.g. the solvers of the IK controller."""
 
     names: Positional[tuple[str, ...]] = ()
-    """Benchmarks; all of them when not given."""
+    """Names of the benchmarks to run, see `wbc-bench list`; all of them when not given."""
     out: Path | None = None
-    """Also write <name>.csv and <name>.md into this folder."""
+    """Folder to write <name>.csv and <name>.md to; nothing is written when not given."""
 
     def run(self) -> None:
         from importlib.metadata import entry_points

@@ -14,13 +14,13 @@ from wbc_bench.cli.common import UsageError
 @dataclass(frozen=True)
 class _Again:
     name: Annotated[Positional[str], tyro.conf.arg(name="run")]
-    """Folder of a run, or <protocol>/<controller>/replicate_<k> of the records."""
+    """Folder of a stored run, or <protocol>/<controller>/replicate_<k> of the records."""
     episode: int = tyro.MISSING
-    """Number of the episode inside its replicate."""
+    """Index of the episode in its replicate, counted from 0."""
     results: Path = Path("results")
-    """Folder of the records."""
+    """Folder to read the records from."""
     protocol: str | None = None
-    """File of the run's protocol, where that is not a released one."""
+    """Path of the .toml file of the run's protocol; needed only if that is not a released one."""
 
     def _check_folder(self, path: Path) -> None:
         """Before minutes are spent on what cannot be written."""
@@ -34,7 +34,7 @@ class Replay(_Again):
     """Run one episode of a stored run again, compare it with its record, and write it as a page to watch."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("replay.html")
-    """Page to write; it needs no network."""
+    """Path of the page to write, FILE.html; the page needs no network."""
 
     def run(self) -> None:
         from wbc_bench.progress import Progress
@@ -53,11 +53,13 @@ class Film(_Again):
     """Run one episode of a stored run again and film it, or draw successive pictures of it side by side."""
 
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Film to write (.mp4)."""
+    """Path of the film to write, FILE.mp4; no film when not given."""
     strip: Path | None = None
-    """Strip of pictures to write (.png), and its caption beside it (.txt)."""
+    """Path of the strip of pictures to write, FILE.png, with its caption beside it as FILE.txt; no strip when
+    not given."""
     times: tuple[float, ...] | None = None
-    """Seconds of the pictures of a strip; six, evenly over the episode, when not given."""
+    """Times since the start of the episode of the strip's pictures [s]; six, evenly over the episode, when
+    not given."""
 
     def run(self) -> None:
         from matplotlib import image
