@@ -132,6 +132,40 @@ def test_other_mistakes(capsys, tmp_path, monkeypatch, arguments):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("compare", "hold", "ik"),
+        ("report",),
+        ("replay", "smoke_v1/hold/replicate_0", "--episode", 0),
+        ("film", "smoke_v1/hold/replicate_0", "--episode", 0, "-o", "film.mp4"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_the_default_folder_without_records_names_the_committed_ones(
+    capsys, tmp_path, monkeypatch, arguments
+):
+    """A checkout holds committed records in `results`; a user's own never go there unasked."""
+    monkeypatch.chdir(tmp_path)
+    line = fails(capsys, *arguments)
+    assert "no records under 'wbc-results'" in line and "--results results" in line
+    main(["list"])
+    assert "--results results" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_own_runs_are_written_to_and_read_from_the_default_folder(capsys, tiny, monkeypatch):
+    monkeypatch.chdir(tiny.parent)
+    before = set(tiny.parent.iterdir())
+    main(["eval", "--controller", "hold", "--protocol", str(tiny), "--workers", "1"])
+    assert set(tiny.parent.iterdir()) - before == {tiny.parent / "wbc-results"}
+    main(["report"])
+    assert (tiny.parent / "wbc-results/report.html").exists()
+    capsys.readouterr()
+    main(["list"])
+    assert "Runs under wbc-results" in capsys.readouterr().out
+
+
 def test_no_traceback_and_exit_code_in_a_real_process(tmp_path):
     command = [sys.executable, "-m", "wbc_bench", "ablation", "--seeds", "0"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)

@@ -3,8 +3,16 @@
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from wbc_bench.errors import BenchError
+from wbc_bench.errors import BenchError, StoreError
+
+if TYPE_CHECKING:
+    from wbc_bench.results.store import ResultStore
+
+RESULTS = Path("wbc-results")  # of one's own runs; the committed ones of a checkout are in `results`
+NO_RECORDS = "no records under '{}'; those committed in a checkout are shown with --results results"
 
 # One thread a worker, whatever a library would like: set before numpy is loaded, inherited by workers.
 THREADS = {
@@ -45,6 +53,20 @@ def within(option: str, value: int | None, most: int, what: str) -> int:
     if not 1 <= value <= most:
         raise UsageError(f"{option} {value}: valid: 1 to {most} ({what})")
     return value
+
+
+def open_records(results: Path) -> "ResultStore":
+    """Open a folder for a command that reads its records.
+
+    Raises:
+        StoreError: It holds none, of whatever kind.
+    """
+    from wbc_bench.results.store import ResultStore
+
+    kinds = ("runs/*/*/*/run.json", "doors/*/*/*/run.json", "tracks/*/*/*/track.json")
+    if not any(next(results.glob(kind), None) for kind in kinds):
+        raise StoreError(NO_RECORDS.format(results))
+    return ResultStore(results)
 
 
 def print_table(table) -> None:

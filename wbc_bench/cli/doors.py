@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from wbc_bench.cli.common import UsageError, at_least_one, cores, not_negative, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, at_least_one, cores, not_negative, print_table
 from wbc_bench.errors import UnknownNameError
 
 
@@ -106,7 +106,7 @@ class DemoEval:
     of ablation_v1)."""
     workers: int = field(default_factory=cores)
     """Number of worker processes; the results do not depend on it."""
-    out: Path = Path("results")
+    out: Path = RESULTS
     """Folder to write the record and the table to."""
 
     def run(self) -> None:

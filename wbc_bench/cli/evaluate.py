@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from wbc_bench.cli.common import UsageError, at_least_one, cores, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, at_least_one, cores, print_table
 
 if TYPE_CHECKING:
     from wbc_bench.results.store import ResultStore
@@ -25,7 +25,7 @@ class _Evaluation:
     engine: str = "loky"
     """Engine that computes the episodes: loky (processes of this machine), dask (a cluster started here) or
     dask=ADDRESS (a running scheduler)."""
-    out: Path = Path("results")
+    out: Path = RESULTS
     """Folder to write records, tables and figures to; an interrupted evaluation resumes there."""
     overwrite: FlagCreatePairsOff[bool] = False
     """Evaluate again what the folder holds already, and replace each run once the new one is complete."""

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from wbc_bench.cli.common import print_table
+from wbc_bench.cli.common import NO_RECORDS, RESULTS, print_table
 from wbc_bench.errors import UnknownNameError
 
 BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
@@ -20,7 +20,7 @@ INPUTS = (
 class List:
     """List controllers, protocols, sources, metrics, benchmarks and runs."""
 
-    results: Path = Path("results")
+    results: Path = RESULTS
     """Folder to read the records from."""
     inputs: FlagCreatePairsOff[bool] = False
     """List, instead of all that, which term stands in which column of the inputs of learned controllers."""
@@ -86,7 +86,10 @@ class List:
             for path, shards in store.unfinished()
         ]
         header = ("Protocol", "Controller", "Replicate", "Episodes", "Created (UTC)", "Commit")
-        print_table(Table("runs", f"Runs under {self.results}", header, tuple(rows)))
+        if rows:
+            print_table(Table("runs", f"Runs under {self.results}", header, tuple(rows)))
+        else:
+            print(NO_RECORDS.format(self.results))
 
 
 @dataclass(frozen=True)

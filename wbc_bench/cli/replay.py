@@ -3,12 +3,15 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from wbc_bench.cli.common import UsageError
+from wbc_bench.cli.common import RESULTS, UsageError, open_records
+
+if TYPE_CHECKING:
+    from wbc_bench.results.store import Run
 
 
 @dataclass(frozen=True)
@@ -17,10 +20,18 @@ class _Again:
     """Folder of a stored run, or <protocol>/<controller>/replicate_<k> of the records."""
     episode: int = tyro.MISSING
     """Index of the episode in its replicate, counted from 0."""
-    results: Path = Path("results")
+    results: Path = RESULTS
     """Folder to read the records from."""
     protocol: str | None = None
     """Path of the .toml file of the run's protocol; needed only if that is not a released one."""
+
+    def _find(self) -> "Run":
+        """The run, given by its folder or by its name below the folder of the records."""
+        from wbc_bench.results.store import ResultStore
+
+        if (Path(self.name) / "run.json").exists():
+            return ResultStore(self.results).find(self.name)
+        return open_records(self.results).find(self.name)
 
     def _check_folder(self, path: Path) -> None:
         """Before minutes are spent on what cannot be written."""
@@ -38,11 +49,10 @@ class Replay(_Again):
 
     def run(self) -> None:
         from wbc_bench.progress import Progress
-        from wbc_bench.results.store import ResultStore
         from wbc_bench.viewer.replay import write_html
 
         self._check_folder(self.out)
-        run = ResultStore(self.results).find(self.name)
+        run = self._find()
         with Progress("steps") as progress:
             again = write_html(run, self.episode, self.out, self.protocol, progress.update)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}\n{self.out}")
@@ -74,7 +84,6 @@ class Film(_Again):
 
         from wbc_bench.files import write_atomic
         from wbc_bench.progress import Progress
-        from wbc_bench.results.store import ResultStore
         from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
         from wbc_bench.viewer.rerun import rerun
 
@@ -85,7 +94,7 @@ class Film(_Again):
                 raise UsageError(f"'{path}': valid: a file that ends in {suffix}")
             if path:
                 self._check_folder(path)
-        run = ResultStore(self.results).find(self.name)
+        run = self._find()
         with Progress("steps") as progress:
             again = rerun(run, self.episode, self.protocol, progress.update)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}")

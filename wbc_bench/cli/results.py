@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from wbc_bench.cli.common import UsageError, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, open_records, print_table
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Compare:
     """Second controller, which the first one is compared with."""
     protocol: str = "ablation_v1"
     """Name of the protocol of the runs."""
-    results: Path = Path("results")
+    results: Path = RESULTS
     """Folder to read the records from."""
     out: Path | None = None
     """Folder to write the table to; it is only printed when not given."""
@@ -28,11 +28,10 @@ class Compare:
     def run(self) -> None:
         from wbc_bench.files import ensure_writable
         from wbc_bench.results.analysis import collect
-        from wbc_bench.results.store import ResultStore
         from wbc_bench.results.tables.pairs import compare_table
         from wbc_bench.results.tables.write import write_compare_table
 
-        evaluated = collect(ResultStore(self.results).runs(self.protocol))
+        evaluated = collect(open_records(self.results).runs(self.protocol))
         print_table(compare_table(self.protocol, evaluated, self.a, self.b))
         if self.out:
             ensure_writable(self.out)
@@ -43,7 +42,7 @@ class Compare:
 class Report:
     """Make every table, every figure and report.html anew from the records; nothing is evaluated."""
 
-    results: Path = Path("results")
+    results: Path = RESULTS
     """Folder to read the records from."""
     out: Path | None = None
     """Folder to write tables, figures and report.html to; the folder of the records when not given."""
@@ -53,9 +52,8 @@ class Report:
 
     def run(self) -> None:
         from wbc_bench.publish import publish
-        from wbc_bench.results.store import ResultStore
 
-        for path in publish(ResultStore(self.results), self.out or self.results, self.workspace):
+        for path in publish(open_records(self.results), self.out or self.results, self.workspace):
             print(path)
 
 
@@ -71,7 +69,7 @@ class Latent:
     """Number of episodes, the first ones of replicate 0; half of them are held out to test LDA."""
     seed: int = 0
     """Seed of the split into halves, of the choice of the points drawn and of t-SNE."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("results/figures")
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = RESULTS / "figures"
     """Folder to write the figure and its numbers to; the report of the folder above shows them."""
 
     def run(self) -> None:

@@ -12,7 +12,7 @@ from wbc_bench.errors import UnknownNameError
 
 if TYPE_CHECKING:
     from wbc_bench.results.tracking import Tracked
-from wbc_bench.cli.common import UsageError, check_port, host, not_negative, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, check_port, host, not_negative, print_table
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Track:
     """TCP port of the page of `live`, 1 to 65535."""
     allow_remote: FlagCreatePairsOff[bool] = False
     """Let other machines reach the stream or the page, and move the robot."""
-    out: Path = Path("results")
+    out: Path = RESULTS
     """Folder to write records, table and figure to."""
 
     def run(self) -> None:
