@@ -215,6 +215,60 @@ def test_eval_report_compare_list(capsys, tiny, tmp_path):
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == first
 
 
+def listed_controllers(text: str) -> list[list[str]]:
+    """Cells of the rows of the table of controllers."""
+    table = text.partition("## Controllers")[2].partition("\n## ")[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[4:] if line]
+
+
+def test_every_listed_controller_can_be_given(capsys, tmp_path):
+    pytest.importorskip("torch")
+    from wbc_bench.registry import load_controller, spec_of_replicate
+    from wbc_bench.robot import load_robot
+
+    main(["list", "--results", str(tmp_path)])
+    names = [row[0] for row in listed_controllers(capsys.readouterr().out)]
+    assert {"hold", "ik", "ik:kinematic", "ik:osqp", "ik:standing", "onnx:FILE.onnx"} <= set(names)
+    assert any(name.startswith("learned:") and name.endswith("@0") for name in names)
+    for name in names:
+        if "FILE" not in name:
+            load_controller(spec_of_replicate(name, 0), load_robot())
+
+
+def test_list_shows_successes_of_a_method_and_of_its_seed(capsys):
+    main(["list", "--results", str(Path(__file__).parents[1] / "results")])
+    text = capsys.readouterr().out
+    rows = {name: success for name, success, *_ in listed_controllers(text)}
+    episodes = [int(cell.partition("/")[2]) for cell in rows.values() if cell]
+    assert episodes and all(count % 1000 == 0 for count in episodes)
+    one_seed = [name for name in rows if rows[name].endswith("/1000") and name.endswith("@0")]
+    assert one_seed and all(rows[name] == rows[name.removesuffix("@0")] for name in one_seed)
+    assert "## Studies" in text and "| reach_v1 | reach_v1 |" in text
+
+
+def test_list_needs_no_torch(tmp_path):
+    code = "import sys; from wbc_bench.cli.main import main; main(['list']); sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "learned:" in done.stdout and "control steps of training" in done.stdout
+
+
+def test_installed_factories_without_variants_or_that_fail_are_listed(capsys, tmp_path, monkeypatch):
+    from importlib.metadata import EntryPoint
+
+    from wbc_bench import registry
+
+    found = {
+        "plain": EntryPoint("plain", "json:dumps", registry.ENTRY_POINTS),
+        "gone": EntryPoint("gone", "no_such_module:Mine", registry.ENTRY_POINTS),
+    }
+    monkeypatch.setattr(registry, "controllers", lambda: found)
+    main(["list", "--results", str(tmp_path)])
+    rows = {row[0]: row for row in listed_controllers(capsys.readouterr().out)}
+    assert rows["plain"][2:] == ["", "json:dumps"]
+    assert "cannot be loaded" in rows["gone"][2] and "no_such_module" in rows["gone"][2]
+
+
 def test_a_failing_report_leaves_the_old_one(capsys, tiny, tmp_path, monkeypatch):
     from wbc_bench.results import report
 
