@@ -175,6 +175,54 @@ def test_no_traceback_and_exit_code_in_a_real_process(tmp_path):
     assert unknown.returncode == 2 and "Traceback" not in unknown.stderr
 
 
+def shell(command: str, folder: Path) -> subprocess.CompletedProcess:
+    """Run a shell line in which $BENCH is wbc-bench."""
+    environment = os.environ | {"BENCH": f"{sys.executable} -m wbc_bench"}
+    line = ["bash", "-o", "pipefail", "-c", command]
+    return subprocess.run(line, capture_output=True, text=True, cwd=folder, env=environment)
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        ("lsit --help", "list"),
+        ("nonsense --help", "bench"),
+        ("demo evla --help", "eval"),
+        ("reprot", "report"),
+    ],
+)
+def test_unknown_command_is_one_line_even_with_help(tmp_path, words, near):
+    done = shell(f"$BENCH {words}", tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert done.stderr.startswith("error: unknown command") and near in done.stderr
+
+
+def test_version_and_completion(tmp_path):
+    from importlib.metadata import version
+
+    done = shell("$BENCH --version", tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"wbc-bench {version('wbc-bench')}\n")
+    text = shell("$BENCH --help", tmp_path).stdout
+    assert "--version" in text and "--tyro-print-completion" in text
+    done = shell("$BENCH --tyro-print-completion bash", tmp_path)
+    assert done.returncode == 0 and "ablation" in done.stdout
+
+
+@pytest.mark.parametrize("words", ["list", "--help", "--version"])
+@pytest.mark.parametrize("reader", ["head -1", "true"])
+def test_a_reader_that_goes_away_is_no_error(tmp_path, words, reader):
+    """With `true`, the pipe is broken when the buffered output is written, at the end of the command."""
+    done = shell(f"$BENCH {words} | {reader}", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("words", ["list", "--help"])
+def test_a_full_disk_is_one_line(tmp_path, words):
+    done = shell(f"$BENCH {words} > /dev/full", tmp_path)
+    assert (done.returncode, done.stderr) == (2, "error: No space left on device\n")
+
+
 def test_interrupted_says_that_it_resumes(tmp_path):
     tiny = write_tiny(tmp_path, episodes=120)
     spec = write_controller(tmp_path, "pausing", "time.sleep(0.1)")

@@ -1,5 +1,6 @@
 """What all commands share: checks of options, tables on the terminal, and how a command ends."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable
@@ -79,14 +80,41 @@ def print_table(table) -> None:
 
 
 def run_command(run: Callable[[], None], interrupted: str) -> None:
-    """Run a command; exits with 2 on a mistake of the user and with 130, and a remark, when interrupted."""
+    """Run a command and make sure that its output is written.
+
+    A mistake of the user and a failure of the system, e.g. a full disk, end with exit code 2 and one line, an
+    interruption with 130 and a remark.
+    """
     try:
-        run()
+        try:
+            run()
+        except SystemExit:  # of --help, whose text is still to be written
+            sys.stdout.flush()
+            raise
+        sys.stdout.flush()
     except BenchError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        _fail(str(error))
     except BrokenPipeError:  # the reader went away, e.g. `| head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _end_output()
+    except OSError as error:
+        place = "" if error.filename is None else f"'{error.filename}': "
+        _fail(f"{place}{error.strerror or error}")
     except KeyboardInterrupt:
+        _end_output()
         print(f"interrupted: {interrupted}", file=sys.stderr)
         sys.exit(130)
+
+
+def _fail(text: str) -> None:
+    _end_output()
+    print(f"error: {' '.join(text.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _end_output() -> None:
+    """Write what is buffered, or drop it where that fails: Python would try again at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError):  # an output without a descriptor has nothing to try again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
