@@ -16,7 +16,7 @@ reach: .venv/installed  ## live, the vertical reach of the IK controller; resume
 	$(BENCH) reach --controller ik --out build/reach
 
 rebuild: .venv/installed  ## every table, figure and the report, from the committed records
-	$(BENCH) report
+	$(BENCH) report --results results
 
 test: .venv/installed
 	.venv/bin/python -m pytest

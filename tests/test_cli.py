@@ -132,6 +132,40 @@ def test_other_mistakes(capsys, tmp_path, monkeypatch, arguments):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("compare", "hold", "ik"),
+        ("report",),
+        ("replay", "smoke_v1/hold/replicate_0", "--episode", 0),
+        ("film", "smoke_v1/hold/replicate_0", "--episode", 0, "-o", "film.mp4"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_the_default_folder_without_records_names_the_committed_ones(
+    capsys, tmp_path, monkeypatch, arguments
+):
+    """A checkout holds committed records in `results`; a user's own never go there unasked."""
+    monkeypatch.chdir(tmp_path)
+    line = fails(capsys, *arguments)
+    assert "no records under 'wbc-results'" in line and "--results results" in line
+    main(["list"])
+    assert "--results results" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_own_runs_are_written_to_and_read_from_the_default_folder(capsys, tiny, monkeypatch):
+    monkeypatch.chdir(tiny.parent)
+    before = set(tiny.parent.iterdir())
+    main(["eval", "--controller", "hold", "--protocol", str(tiny), "--workers", "1"])
+    assert set(tiny.parent.iterdir()) - before == {tiny.parent / "wbc-results"}
+    main(["report"])
+    assert (tiny.parent / "wbc-results/report.html").exists()
+    capsys.readouterr()
+    main(["list"])
+    assert "Runs under wbc-results" in capsys.readouterr().out
+
+
 def test_no_traceback_and_exit_code_in_a_real_process(tmp_path):
     command = [sys.executable, "-m", "wbc_bench", "ablation", "--seeds", "0"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
@@ -139,6 +173,54 @@ def test_no_traceback_and_exit_code_in_a_real_process(tmp_path):
     assert done.stderr.startswith("error: --replicates 0") and done.stderr.count("\n") == 1
     unknown = subprocess.run([*command[:3], "--sedes", "1"], capture_output=True, text=True, cwd=tmp_path)
     assert unknown.returncode == 2 and "Traceback" not in unknown.stderr
+
+
+def shell(command: str, folder: Path) -> subprocess.CompletedProcess:
+    """Run a shell line in which $BENCH is wbc-bench."""
+    environment = os.environ | {"BENCH": f"{sys.executable} -m wbc_bench"}
+    line = ["bash", "-o", "pipefail", "-c", command]
+    return subprocess.run(line, capture_output=True, text=True, cwd=folder, env=environment)
+
+
+@pytest.mark.parametrize(
+    ("words", "near"),
+    [
+        ("lsit --help", "list"),
+        ("nonsense --help", "bench"),
+        ("demo evla --help", "eval"),
+        ("reprot", "report"),
+    ],
+)
+def test_unknown_command_is_one_line_even_with_help(tmp_path, words, near):
+    done = shell(f"$BENCH {words}", tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1), done.stderr
+    assert done.stderr.startswith("error: unknown command") and near in done.stderr
+
+
+def test_version_and_completion(tmp_path):
+    from importlib.metadata import version
+
+    done = shell("$BENCH --version", tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"wbc-bench {version('wbc-bench')}\n")
+    text = shell("$BENCH --help", tmp_path).stdout
+    assert "--version" in text and "--tyro-print-completion" in text
+    done = shell("$BENCH --tyro-print-completion bash", tmp_path)
+    assert done.returncode == 0 and "ablation" in done.stdout
+
+
+@pytest.mark.parametrize("words", ["list", "--help", "--version"])
+@pytest.mark.parametrize("reader", ["head -1", "true"])
+def test_a_reader_that_goes_away_is_no_error(tmp_path, words, reader):
+    """With `true`, the pipe is broken when the buffered output is written, at the end of the command."""
+    done = shell(f"$BENCH {words} | {reader}", tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("words", ["list", "--help"])
+def test_a_full_disk_is_one_line(tmp_path, words):
+    done = shell(f"$BENCH {words} > /dev/full", tmp_path)
+    assert (done.returncode, done.stderr) == (2, "error: No space left on device\n")
 
 
 def test_interrupted_says_that_it_resumes(tmp_path):
@@ -179,6 +261,60 @@ def test_eval_report_compare_list(capsys, tiny, tmp_path):
     assert out / "report.html" in first and list(out.glob("figures/*.svg")) and list(out.glob("tables/*.tex"))
     main(["report", "--results", str(out)])
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == first
+
+
+def listed_controllers(text: str) -> list[list[str]]:
+    """Cells of the rows of the table of controllers."""
+    table = text.partition("## Controllers")[2].partition("\n## ")[0]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[4:] if line]
+
+
+def test_every_listed_controller_can_be_given(capsys, tmp_path):
+    pytest.importorskip("torch")
+    from wbc_bench.registry import load_controller, spec_of_replicate
+    from wbc_bench.robot import load_robot
+
+    main(["list", "--results", str(tmp_path)])
+    names = [row[0] for row in listed_controllers(capsys.readouterr().out)]
+    assert {"hold", "ik", "ik:kinematic", "ik:osqp", "ik:standing", "onnx:FILE.onnx"} <= set(names)
+    assert any(name.startswith("learned:") and name.endswith("@0") for name in names)
+    for name in names:
+        if "FILE" not in name:
+            load_controller(spec_of_replicate(name, 0), load_robot())
+
+
+def test_list_shows_successes_of_a_method_and_of_its_seed(capsys):
+    main(["list", "--results", str(Path(__file__).parents[1] / "results")])
+    text = capsys.readouterr().out
+    rows = {name: success for name, success, *_ in listed_controllers(text)}
+    episodes = [int(cell.partition("/")[2]) for cell in rows.values() if cell]
+    assert episodes and all(count % 1000 == 0 for count in episodes)
+    one_seed = [name for name in rows if rows[name].endswith("/1000") and name.endswith("@0")]
+    assert one_seed and all(rows[name] == rows[name.removesuffix("@0")] for name in one_seed)
+    assert "## Studies" in text and "| reach_v1 | reach_v1 |" in text
+
+
+def test_list_needs_no_torch(tmp_path):
+    code = "import sys; from wbc_bench.cli.main import main; main(['list']); sys.exit('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "learned:" in done.stdout and "control steps of training" in done.stdout
+
+
+def test_installed_factories_without_variants_or_that_fail_are_listed(capsys, tmp_path, monkeypatch):
+    from importlib.metadata import EntryPoint
+
+    from wbc_bench import registry
+
+    found = {
+        "plain": EntryPoint("plain", "json:dumps", registry.ENTRY_POINTS),
+        "gone": EntryPoint("gone", "no_such_module:Mine", registry.ENTRY_POINTS),
+    }
+    monkeypatch.setattr(registry, "controllers", lambda: found)
+    main(["list", "--results", str(tmp_path)])
+    rows = {row[0]: row for row in listed_controllers(capsys.readouterr().out)}
+    assert rows["plain"][2:] == ["", "json:dumps"]
+    assert "cannot be loaded" in rows["gone"][2] and "no_such_module" in rows["gone"][2]
 
 
 def test_a_failing_report_leaves_the_old_one(capsys, tiny, tmp_path, monkeypatch):

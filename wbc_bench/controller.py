@@ -129,6 +129,15 @@ class SeededFactory(Protocol):
         ...
 
 
+@runtime_checkable
+class HasVariants(Protocol):
+    """A factory that names its variants, for `wbc-bench list`."""
+
+    def variants(self) -> list[tuple[str, str]]:
+        """Return (variant, description); the variant "" is the controller's name alone."""
+        ...
+
+
 class Controller(Protocol):
     """A batched controller. It is built by calling its factory with the `Robot` it will drive."""
 

@@ -32,15 +32,17 @@ class Progress:
 
     def update(self, done: int, total: int, what: str = "") -> None:
         """`done` of `total` units are done, the latest of `what`."""
+        first = self.done == 0
         self.done, self.total = done, total
         now = time.monotonic()
         if self._bar:
             rate = f"{self._rate(now):.1f} {self.unit}/s"
             self._bar.update(self._task, completed=done, total=total, description=what, rate=rate)
-        elif now - self._last >= LINE_PERIOD:
+        elif (first and 0 < done < total) or now - self._last >= LINE_PERIOD:
             self._last = now
             rate = self._rate(now)
-            left = f"{(total - done) / rate:.0f} s left" if rate else "time left unknown"
+            # the first units also waited for processes to start: they say little of the others
+            left = f"{(total - done) / rate:.0f} s left" if rate and not first else "time left unknown"
             self._line(f"{left}{', ' if what else ''}{what}")
 
     def _rate(self, now: float) -> float:

@@ -17,6 +17,11 @@ class HoldController:
         self.info = ControllerInfo("hold", frozenset(), control_period=0.02, source="wbc_baselines.hold")
         self._default_q = robot.default_q
 
+    @staticmethod
+    def variants() -> list[tuple[str, str]]:
+        """Return the only variant, with its description."""
+        return [("", "Holds the default posture.")]
+
     def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
         """Nothing to forget."""
         self._command = JointCommand(np.tile(self._default_q, (len(episodes), 1)))

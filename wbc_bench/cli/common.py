@@ -1,10 +1,19 @@
 """What all commands share: checks of options, tables on the terminal, and how a command ends."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from wbc_bench.errors import BenchError
+from wbc_bench.errors import BenchError, StoreError
+
+if TYPE_CHECKING:
+    from wbc_bench.results.store import ResultStore
+
+RESULTS = Path("wbc-results")  # of one's own runs; the committed ones of a checkout are in `results`
+NO_RECORDS = "no records under '{}'; those committed in a checkout are shown with --results results"
 
 # One thread a worker, whatever a library would like: set before numpy is loaded, inherited by workers.
 THREADS = {
@@ -47,6 +56,20 @@ def within(option: str, value: int | None, most: int, what: str) -> int:
     return value
 
 
+def open_records(results: Path) -> "ResultStore":
+    """Open a folder for a command that reads its records.
+
+    Raises:
+        StoreError: It holds none, of whatever kind.
+    """
+    from wbc_bench.results.store import ResultStore
+
+    kinds = ("runs/*/*/*/run.json", "doors/*/*/*/run.json", "tracks/*/*/*/track.json")
+    if not any(next(results.glob(kind), None) for kind in kinds):
+        raise StoreError(NO_RECORDS.format(results))
+    return ResultStore(results)
+
+
 def print_table(table) -> None:
     if sys.stdout.isatty():
         from rich.console import Console
@@ -57,14 +80,41 @@ def print_table(table) -> None:
 
 
 def run_command(run: Callable[[], None], interrupted: str) -> None:
-    """Run a command; exits with 2 on a mistake of the user and with 130, and a remark, when interrupted."""
+    """Run a command and make sure that its output is written.
+
+    A mistake of the user and a failure of the system, e.g. a full disk, end with exit code 2 and one line, an
+    interruption with 130 and a remark.
+    """
     try:
-        run()
+        try:
+            run()
+        except SystemExit:  # of --help, whose text is still to be written
+            sys.stdout.flush()
+            raise
+        sys.stdout.flush()
     except BenchError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        _fail(str(error))
     except BrokenPipeError:  # the reader went away, e.g. `| head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _end_output()
+    except OSError as error:
+        place = "" if error.filename is None else f"'{error.filename}': "
+        _fail(f"{place}{error.strerror or error}")
     except KeyboardInterrupt:
+        _end_output()
         print(f"interrupted: {interrupted}", file=sys.stderr)
         sys.exit(130)
+
+
+def _fail(text: str) -> None:
+    _end_output()
+    print(f"error: {' '.join(text.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _end_output() -> None:
+    """Write what is buffered, or drop it where that fails: Python would try again at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with contextlib.suppress(OSError):  # an output without a descriptor has nothing to try again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

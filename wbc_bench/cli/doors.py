@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from wbc_bench.cli.common import UsageError, at_least_one, cores, not_negative, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, at_least_one, cores, not_negative, print_table
 from wbc_bench.errors import UnknownNameError
 
 
@@ -16,15 +16,15 @@ class DemoRecord:
     """Record an expert that pushes doors shut, in UMI's zarr layout; equal options give equal bytes."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = tyro.MISSING
-    """File to write: FILE.zarr.zip."""
+    """Path of the file to write, FILE.zarr.zip."""
     episodes: int = 100
-    """Doors."""
+    """Number of episodes, each in front of a door of its own."""
     seed: int = 0
-    """Of the doors."""
+    """Seed of the random generator that draws the doors."""
     controller: str = "ik"
-    """Controller that the expert drives."""
+    """Controller that the expert drives: name, name:variant, module:attribute or file.py:attribute."""
     workers: int = field(default_factory=cores)
-    """Processes; the file does not depend on it."""
+    """Number of worker processes; the file does not depend on it."""
 
     def run(self) -> None:
         from wbc_bench.evaluation.doors import record
@@ -45,13 +45,13 @@ class DemoTrain:
     """Train a diffusion policy on demonstrations; a few minutes on one core."""
 
     demonstrations: Positional[Path]
-    """File that `demo record` wrote."""
+    """Path of a file that `demo record` wrote."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = tyro.MISSING
-    """File to write: POLICY.safetensors."""
+    """Path of the file to write, POLICY.safetensors."""
     seed: int = 0
-    """Of the weights, the windows and the noise."""
+    """Seed of the random generator that draws weights, windows and noise."""
     updates: int = 6000
-    """Steps of the optimiser."""
+    """Number of optimiser steps."""
 
     def run(self) -> None:
         import time
@@ -92,21 +92,22 @@ class DemoEval:
     """Let a policy, or the expert, drive a controller in front of doors, and count the closed ones."""
 
     policy: Positional[Path | None] = None
-    """File that `demo train` wrote; the packaged policy when not given."""
+    """Path of a file that `demo train` wrote; the packaged policy when not given."""
     controller: str = "ik"
-    """Controller: name, name:variant, module:attribute or file.py:attribute."""
+    """Controller to drive: name, name:variant, module:attribute or file.py:attribute."""
     expert: FlagCreatePairsOff[bool] = False
-    """The scripted expert instead of a policy."""
+    """Let the scripted expert drive the controller instead of a policy."""
     episodes: int = 50
-    """Doors."""
+    """Number of episodes, each in front of a door of its own."""
     seed: int = 1
-    """Of the doors and the policy's noise; not that of the demonstrations."""
+    """Seed of the doors and of the policy's noise; give another one than for the demonstrations."""
     condition: str = "nominal"
-    """nominal, or randomised: friction, mass, gains, reset state, pushes and noise of ablation_v1."""
+    """Condition of the episodes: nominal, or randomised (friction, mass, gains, reset state, pushes and noise
+    of ablation_v1)."""
     workers: int = field(default_factory=cores)
-    """Processes; the results do not depend on it."""
-    out: Path = Path("results")
-    """Folder of the record and the table."""
+    """Number of worker processes; the results do not depend on it."""
+    out: Path = RESULTS
+    """Folder to write the record and the table to."""
 
     def run(self) -> None:
         from wbc_bench.episodes.single import CONDITIONS

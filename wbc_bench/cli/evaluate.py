@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff
 
-from wbc_bench.cli.common import UsageError, at_least_one, cores, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, at_least_one, cores, print_table
 
 if TYPE_CHECKING:
     from wbc_bench.results.store import ResultStore
@@ -23,12 +23,12 @@ class _Evaluation:
     workers: int = field(default_factory=cores)
     """Number of worker processes; the results do not depend on it."""
     engine: str = "loky"
-    """Engine that computes shards: loky (processes of this machine), dask (a cluster started here) or
+    """Engine that computes the episodes: loky (processes of this machine), dask (a cluster started here) or
     dask=ADDRESS (a running scheduler)."""
-    out: Path = Path("results")
-    """Folder of records, tables and figures; an interrupted evaluation resumes there."""
+    out: Path = RESULTS
+    """Folder to write records, tables and figures to; an interrupted evaluation resumes there."""
     overwrite: FlagCreatePairsOff[bool] = False
-    """Evaluate again what the folder holds already, and replace it when the new run is whole."""
+    """Evaluate again what the folder holds already, and replace each run once the new one is complete."""
 
     def _evaluate(
         self,
@@ -57,13 +57,15 @@ class Ablation(_Evaluation):
     """Evaluate every controller of a study on the same episodes, and write its tables and figures."""
 
     study: str = "ablation_v1"
-    """Name of a released study, or a .toml file: the controllers that share a table, and the pairs tested."""
+    """Name of a released study, or path of a .toml file: the controllers that share a table, and the pairs of
+    them that are tested against each other."""
     replicates: Replicates = None
     """Number of replicates of the protocol to evaluate; all of them when not given."""
     episodes: int | None = None
     """Number of episodes of each replicate, from the first on; all of them when not given."""
     controllers: tuple[str, ...] = ()
-    """Controllers to evaluate instead of those that the study lists."""
+    """Controllers to evaluate instead of those that the study lists, each a name, name:variant,
+    module:attribute or file.py:attribute."""
 
     def run(self) -> None:
         from wbc_bench.publish import publish
@@ -91,9 +93,9 @@ class Reach(_Evaluation):
     """Find the heights that controllers reach straight ahead, and write the figure."""
 
     controller: tuple[str, ...] = ("ik",)
-    """Controllers, each a name, name:variant, module:attribute or file.py:attribute."""
+    """Controllers to evaluate, each a name, name:variant, module:attribute or file.py:attribute."""
     protocol: str = "reach_v1"
-    """Name of a released reach protocol, or a .toml file with its manifest beside it."""
+    """Name of a released reach protocol, or path of a .toml file with its manifest beside it."""
 
     def run(self) -> None:
         from wbc_bench.episodes.protocol import ReachTargets, find_protocol
@@ -117,9 +119,9 @@ class Eval(_Evaluation):
     """Evaluate controllers under any protocol and print how the episodes ended."""
 
     controller: tuple[str, ...] = tyro.MISSING
-    """Controllers, each a name, name:variant, module:attribute or file.py:attribute."""
+    """Controllers to evaluate, each a name, name:variant, module:attribute or file.py:attribute."""
     protocol: str = tyro.MISSING
-    """Name of a released protocol, or a .toml file with its manifest beside it."""
+    """Name of a released protocol, or path of a .toml file with its manifest beside it."""
     replicates: Replicates = None
     """Number of replicates of the protocol to evaluate; all of them when not given."""
     episodes: int | None = None

@@ -2,14 +2,22 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from wbc_bench.cli.common import print_table
+from wbc_bench.cli.common import NO_RECORDS, RESULTS, print_table
 from wbc_bench.errors import UnknownNameError
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from importlib.metadata import EntryPoint
+
+    from wbc_bench.results.store import Run, RunRecord
+    from wbc_bench.results.table import Table
+
+SHOWN = "ablation_v1"  # protocol whose successes stand beside the controllers
 BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
 INPUTS = (
     "wbc_bench.inputs"  # entry points: name -> a callable that returns rows (vector, columns, term, unit)
@@ -18,75 +26,170 @@ INPUTS = (
 
 @dataclass(frozen=True)
 class List:
-    """List controllers, protocols, sources, metrics, benchmarks and runs."""
+    """List controllers with their variants, studies, protocols, sources, metrics, benchmarks and runs."""
 
-    results: Path = Path("results")
-    """Folder of the records."""
+    results: Path = RESULTS
+    """Folder to read the records from."""
     inputs: FlagCreatePairsOff[bool] = False
-    """Instead, what stands in which column of the inputs of learned controllers."""
+    """List, instead of all that, which term stands in which column of the inputs of learned controllers."""
 
     def run(self) -> None:
-        from importlib.metadata import entry_points
-
-        from wbc_bench.results.table import Table
+        from wbc_bench.results.store import ResultStore
 
         if self.inputs:
-            for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
-                header = ("Vector", "Columns", "Size", "Term", "Unit")
-                print_table(Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()())))
+            for table in _inputs():
+                print_table(table)
             return
+        runs = ResultStore(self.results).runs()
+        for table in (_controllers(runs), _studies(), _protocols(), _sources(), _metrics(), _benchmarks()):
+            print_table(table)
+        table = _runs(runs, self.results)
+        if table.rows:
+            print_table(table)
+        else:
+            print(NO_RECORDS.format(self.results))
 
-        from wbc_bench.episodes.manifest import manifest_path
-        from wbc_bench.episodes.protocol import find_protocol, protocol_names
-        from wbc_bench.registry import controllers
-        from wbc_bench.results.metrics import METRICS
-        from wbc_bench.results.store import ResultStore
-        from wbc_bench.sources.registry import find_script, script_names
 
-        rows = [(name, point.value) for name, point in sorted(controllers().items())]
-        print_table(Table("controllers", "Controllers", ("Name", "Comes from"), tuple(rows)))
-        rows = []
-        for name in protocol_names():
-            protocol, path = find_protocol(name)
-            episodes = protocol.episodes
-            size = f"{episodes.replicates} x {episodes.per_replicate} x {episodes.horizon:g} s"
-            frozen = "yes" if manifest_path(path).exists() else "no"
-            rows.append((name, size, frozen, protocol.digest[:12], protocol.description))
-        header = ("Name", "Replicates x episodes", "Frozen", "Digest", "Description")
-        print_table(Table("protocols", "Protocols", header, tuple(rows)))
-        scripts = [find_script(name) for name in script_names()]
-        rows = [
-            *((script.name, script.path.__struct_config__.tag, script.description) for script in scripts),
-            ("stream", "ZeroMQ", "Targets from another program, see wbc_bench/sources/STREAM.md."),
-            ("diffusion", "policy", "Pushes a door shut, see wbc_bench/sources/diffusion/README.md."),
-        ]
-        print_table(Table("sources", "Sources", ("Name", "Kind", "Description"), tuple(rows)))
-        rows = [(metric.name, metric.unit, metric.better, metric.source) for metric in METRICS]
-        print_table(Table("metrics", "Metrics", ("Name", "Unit", "Better", "Source"), tuple(rows)))
-        rows = [(point.name, point.value) for point in entry_points(group=BENCHMARKS)]
-        print_table(Table("benchmarks", "Benchmarks", ("Name", "Comes from"), tuple(rows)))
-        store = ResultStore(self.results)
-        rows = [
-            (
-                *(run.record.protocol, run.record.controller, str(run.record.replicate)),
-                *(f"{run.record.completed}/{run.record.requested}", run.record.created),
-                (run.record.git_commit or "no commit")[:12] + ("+" if run.record.git_dirty else ""),
-            )
-            for run in store.runs()
-        ]
-        rows += [
-            (
-                path.parents[1].name,
-                path.parent.name,
-                path.name.removeprefix("replicate_"),
-                f"{shards} shards",
-                "",
-                "",
-            )
-            for path, shards in store.unfinished()
-        ]
-        header = ("Protocol", "Controller", "Replicate", "Episodes", "Created (UTC)", "Commit")
-        print_table(Table("runs", f"Runs under {self.results}", header, tuple(rows)))
+def _inputs() -> "Iterator[Table]":
+    from importlib.metadata import entry_points
+
+    from wbc_bench.results.table import Table
+
+    for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
+        header = ("Vector", "Columns", "Size", "Term", "Unit")
+        yield Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()()))
+
+
+def _controllers(runs: "list[Run]") -> "Table":
+    """Every name that `--controller` takes, with the episodes of one protocol that the runs solved."""
+    from wbc_bench.registry import controllers
+    from wbc_bench.results.table import Table
+
+    rows = [
+        (f"{name}:{variant}" if variant else name, description, point.value)
+        for name, point in sorted(controllers().items())
+        for variant, description in _variants(point)
+    ]
+    cells = tuple((name, _success(runs, name), *rest) for name, *rest in rows)
+    header = ("Name", f"Success on {SHOWN}", "Description", "Comes from")
+    return Table("controllers", "Controllers", header, cells)
+
+
+def _variants(point: "EntryPoint") -> list[tuple[str, str]]:
+    """(variant, description) of an installed factory; of one that fails, what is wrong with it."""
+    from wbc_bench.controller import HasVariants
+    from wbc_bench.errors import fault_of
+
+    try:
+        factory = point.load()
+        return factory.variants() if isinstance(factory, HasVariants) else [("", "")]
+    except Exception as error:  # somebody else's code: the others are still listed
+        return [("", f"cannot be loaded: {fault_of(error)}")]
+
+
+def _success(runs: "list[Run]", spec: str) -> str:
+    """Episodes of the runs of a controller that succeeded, `successes/episodes`; empty without a run.
+
+    A run counts for the name that was asked for and for the variant that met its replicate.
+    """
+    shown = [run.record for run in runs if run.record.protocol == SHOWN]
+    records = [record for record in shown if spec in (record.controller, _met_by(record))]
+    succeeded = sum(record.outcomes.get("success", 0) for record in records)
+    return f"{succeeded}/{sum(record.completed for record in records)}" if records else ""
+
+
+def _met_by(record: "RunRecord") -> str:
+    """Spec of the controller that met the replicate of a run."""
+    from wbc_bench.errors import ControllerError
+    from wbc_bench.registry import spec_of_replicate
+
+    if record.resolved_controller is not None:
+        return record.resolved_controller
+    try:
+        return spec_of_replicate(record.controller, record.replicate)
+    except ControllerError:  # its package cannot be imported here
+        return record.controller
+
+
+def _studies() -> "Table":
+    from wbc_bench.results.study import released_studies
+    from wbc_bench.results.table import Table
+
+    rows = [
+        (study.name, study.protocol, ", ".join(dict.fromkeys(row.spec for row in study.rows)))
+        for study in released_studies()
+    ]
+    return Table("studies", "Studies", ("Name", "Protocol", "Controllers"), tuple(rows))
+
+
+def _protocols() -> "Table":
+    from wbc_bench.episodes.manifest import manifest_path
+    from wbc_bench.episodes.protocol import find_protocol, protocol_names
+    from wbc_bench.results.table import Table
+
+    rows = []
+    for name in protocol_names():
+        protocol, path = find_protocol(name)
+        episodes = protocol.episodes
+        size = f"{episodes.replicates} x {episodes.per_replicate} x {episodes.horizon:g} s"
+        frozen = "yes" if manifest_path(path).exists() else "no"
+        rows.append((name, size, frozen, protocol.digest[:12], protocol.description))
+    header = ("Name", "Replicates x episodes", "Frozen", "Digest", "Description")
+    return Table("protocols", "Protocols", header, tuple(rows))
+
+
+def _sources() -> "Table":
+    from wbc_bench.results.table import Table
+    from wbc_bench.sources.registry import find_script, script_names
+
+    scripts = [find_script(name) for name in script_names()]
+    rows = [
+        *((script.name, script.path.__struct_config__.tag, script.description) for script in scripts),
+        ("stream", "ZeroMQ", "Targets from another program, see wbc_bench/sources/STREAM.md."),
+        ("diffusion", "policy", "Pushes a door shut, see wbc_bench/sources/diffusion/README.md."),
+    ]
+    return Table("sources", "Sources", ("Name", "Kind", "Description"), tuple(rows))
+
+
+def _metrics() -> "Table":
+    from wbc_bench.results.metrics import METRICS
+    from wbc_bench.results.table import Table
+
+    rows = [(metric.name, metric.unit, metric.better, metric.source) for metric in METRICS]
+    return Table("metrics", "Metrics", ("Name", "Unit", "Better", "Source"), tuple(rows))
+
+
+def _benchmarks() -> "Table":
+    from importlib.metadata import entry_points
+
+    from wbc_bench.results.table import Table
+
+    rows = [(point.name, point.value) for point in entry_points(group=BENCHMARKS)]
+    return Table("benchmarks", "Benchmarks", ("Name", "Comes from"), tuple(rows))
+
+
+def _runs(runs: "list[Run]", results: Path) -> "Table":
+    """Finished runs, then those that were interrupted."""
+    from wbc_bench.results.store import ResultStore
+    from wbc_bench.results.table import Table
+
+    rows = [
+        (
+            *(run.record.protocol, run.record.controller, str(run.record.replicate)),
+            *(f"{run.record.completed}/{run.record.requested}", run.record.created),
+            (run.record.git_commit or "no commit")[:12] + ("+" if run.record.git_dirty else ""),
+        )
+        for run in runs
+    ]
+    rows += [
+        (
+            *(path.parents[1].name, path.parent.name, path.name.removeprefix("replicate_")),
+            *(f"{shards} shards", "", ""),
+        )
+        for path, shards in ResultStore(results).unfinished()
+    ]
+    header = ("Protocol", "Controller", "Replicate", "Episodes", "Created (UTC)", "Commit")
+    return Table("runs", f"Runs under {results}", header, tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -94,13 +197,13 @@ class ExportController:
     """Write a controller to a file for other runtimes, normalisers, window and recurrent state included."""
 
     controller: str = tyro.MISSING
-    """Controller that can be exported: name:variant."""
+    """Controller to export: name:variant of one that supports it, e.g. learned:METHOD@SEED."""
     format: str = "onnx"
-    """Format of the file."""
+    """Format of the file to write, one that the controller supports."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """File to write; named after the controller when not given."""
+    """Path of the file to write; named after the controller when not given."""
     protocol: str = "ablation_v1"
-    """Protocol whose robot it drives."""
+    """Name of the protocol, or path of its .toml file, whose robot the controller drives."""
 
     def run(self) -> None:
         from wbc_bench.controller import Exportable
@@ -125,9 +228,9 @@ class Bench:
     """Time what the installed packages offer to be timed, e.g. the solvers of the IK controller."""
 
     names: Positional[tuple[str, ...]] = ()
-    """Benchmarks; all of them when not given."""
+    """Names of the benchmarks to run, see `wbc-bench list`; all of them when not given."""
     out: Path | None = None
-    """Also write <name>.csv and <name>.md into this folder."""
+    """Folder to write <name>.csv and <name>.md to; nothing is written when not given."""
 
     def run(self) -> None:
         from importlib.metadata import entry_points

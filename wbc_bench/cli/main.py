@@ -4,7 +4,10 @@ Each command is a frozen dataclass, its fields the options. Everything heavy is 
 """
 
 import os
-from typing import Annotated
+import sys
+from dataclasses import is_dataclass
+from importlib.metadata import version
+from typing import Annotated, get_args
 
 import tyro
 from tyro.conf import subcommand
@@ -18,6 +21,7 @@ from wbc_bench.cli.replay import Film, Replay
 from wbc_bench.cli.results import Compare, Latent, Report
 from wbc_bench.cli.robot import Export, Picture
 from wbc_bench.cli.tracking import Live, Track
+from wbc_bench.errors import UnknownNameError
 
 Command = (
     Annotated[Ablation, subcommand("ablation")]
@@ -52,10 +56,43 @@ Command = (
 )
 
 
+DESCRIPTION = """Whole-body controllers on identical episodes.
+
+`wbc-bench --version` prints the version; `wbc-bench --tyro-print-completion {bash,zsh,tcsh}` prints a
+script that completes commands and options in a shell."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point; ends as `run_command` says."""
     os.environ.update(THREADS)
-    command = tyro.cli(
-        Command, prog="wbc-bench", description="Whole-body controllers on identical episodes.", args=arguments
-    )
-    run_command(command.run, "finished shards are kept, the same command resumes")
+    words = sys.argv[1:] if arguments is None else arguments
+    run_command(lambda: _run(words), "finished shards are kept, the same command resumes")
+
+
+def _run(words: list[str]) -> None:
+    if words == ["--version"]:
+        print(f"wbc-bench {version('wbc-bench')}")
+        return
+    _check_command(words)
+    tyro.cli(Command, prog="wbc-bench", description=DESCRIPTION, args=words).run()
+
+
+def _check_command(words: list[str]) -> None:
+    """Refuse an unknown command even where `--help` follows it, which the parser answers first.
+
+    Raises:
+        UnknownNameError: The words begin with no command; names the nearest ones.
+    """
+    known, above = Command, "wbc-bench"
+    for word in words:
+        if word.startswith("-"):
+            return
+        names = {}
+        for choice in get_args(known):
+            kind, alias = get_args(choice)[:2]
+            names[alias.name] = kind
+        if word not in names:
+            raise UnknownNameError("command", word, names, f"{above} COMMAND")
+        known, above = names[word], f"{above} {word}"
+        if is_dataclass(known):
+            return

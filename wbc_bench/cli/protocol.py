@@ -13,9 +13,9 @@ class Freeze:
     """Draw the manifest of a protocol and write it beside the protocol file."""
 
     name: Positional[str]
-    """Name of a released protocol, or a .toml file."""
+    """Name of a released protocol, or path of a .toml file."""
     workers: int = field(default_factory=cores)
-    """Processes; the manifest does not depend on it."""
+    """Number of worker processes; the manifest does not depend on it."""
 
     def run(self) -> None:
         from wbc_bench.episodes.freeze import freeze
@@ -35,7 +35,7 @@ class Verify:
     """Check the manifest of a protocol: hash, counts, ranges, feasibility of a sample."""
 
     name: Positional[str]
-    """Name of a released protocol, or a .toml file."""
+    """Name of a released protocol, or path of a .toml file."""
 
     def run(self) -> None:
         from wbc_bench.episodes.manifest import manifest_path
@@ -58,9 +58,9 @@ class Show:
     """Print what a protocol asks for and draw its targets."""
 
     name: Positional[str]
-    """Name of a released protocol, or a .toml file."""
+    """Name of a released protocol, or path of a .toml file."""
     out: Path = Path()
-    """Folder of the picture."""
+    """Folder to write the pictures to; the current one when not given."""
 
     def run(self) -> None:
         import msgspec

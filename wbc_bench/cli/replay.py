@@ -3,24 +3,35 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from tyro.conf import Positional
 
-from wbc_bench.cli.common import UsageError
+from wbc_bench.cli.common import RESULTS, UsageError, open_records
+
+if TYPE_CHECKING:
+    from wbc_bench.results.store import Run
 
 
 @dataclass(frozen=True)
 class _Again:
     name: Annotated[Positional[str], tyro.conf.arg(name="run")]
-    """Folder of a run, or <protocol>/<controller>/replicate_<k> of the records."""
+    """Folder of a stored run, or <protocol>/<controller>/replicate_<k> of the records."""
     episode: int = tyro.MISSING
-    """Number of the episode inside its replicate."""
-    results: Path = Path("results")
-    """Folder of the records."""
+    """Index of the episode in its replicate, counted from 0."""
+    results: Path = RESULTS
+    """Folder to read the records from."""
     protocol: str | None = None
-    """File of the run's protocol, where that is not a released one."""
+    """Path of the .toml file of the run's protocol; needed only if that is not a released one."""
+
+    def _find(self) -> "Run":
+        """The run, given by its folder or by its name below the folder of the records."""
+        from wbc_bench.results.store import ResultStore
+
+        if (Path(self.name) / "run.json").exists():
+            return ResultStore(self.results).find(self.name)
+        return open_records(self.results).find(self.name)
 
     def _check_folder(self, path: Path) -> None:
         """Before minutes are spent on what cannot be written."""
@@ -34,15 +45,14 @@ class Replay(_Again):
     """Run one episode of a stored run again, compare it with its record, and write it as a page to watch."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("replay.html")
-    """Page to write; it needs no network."""
+    """Path of the page to write, FILE.html; the page needs no network."""
 
     def run(self) -> None:
         from wbc_bench.progress import Progress
-        from wbc_bench.results.store import ResultStore
         from wbc_bench.viewer.replay import write_html
 
         self._check_folder(self.out)
-        run = ResultStore(self.results).find(self.name)
+        run = self._find()
         with Progress("steps") as progress:
             again = write_html(run, self.episode, self.out, self.protocol, progress.update)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}\n{self.out}")
@@ -53,11 +63,13 @@ class Film(_Again):
     """Run one episode of a stored run again and film it, or draw successive pictures of it side by side."""
 
     out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Film to write (.mp4)."""
+    """Path of the film to write, FILE.mp4; no film when not given."""
     strip: Path | None = None
-    """Strip of pictures to write (.png), and its caption beside it (.txt)."""
+    """Path of the strip of pictures to write, FILE.png, with its caption beside it as FILE.txt; no strip when
+    not given."""
     times: tuple[float, ...] | None = None
-    """Seconds of the pictures of a strip; six, evenly over the episode, when not given."""
+    """Times since the start of the episode of the strip's pictures [s]; six, evenly over the episode, when
+    not given."""
 
     def run(self) -> None:
         from matplotlib import image
@@ -72,7 +84,6 @@ class Film(_Again):
 
         from wbc_bench.files import write_atomic
         from wbc_bench.progress import Progress
-        from wbc_bench.results.store import ResultStore
         from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
         from wbc_bench.viewer.rerun import rerun
 
@@ -83,7 +94,7 @@ class Film(_Again):
                 raise UsageError(f"'{path}': valid: a file that ends in {suffix}")
             if path:
                 self._check_folder(path)
-        run = ResultStore(self.results).find(self.name)
+        run = self._find()
         with Progress("steps") as progress:
             again = rerun(run, self.episode, self.protocol, progress.update)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}")

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional
 
-from wbc_bench.cli.common import UsageError, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, open_records, print_table
 
 
 @dataclass(frozen=True)
@@ -15,24 +15,23 @@ class Compare:
     """Compare two evaluated controllers on the episodes that both met."""
 
     a: Positional[str]
-    """Controller."""
+    """First controller, by the name that its runs were evaluated under."""
     b: Positional[str]
-    """Controller it is compared with."""
+    """Second controller, which the first one is compared with."""
     protocol: str = "ablation_v1"
-    """Protocol of the runs."""
-    results: Path = Path("results")
-    """Folder of the records."""
+    """Name of the protocol of the runs."""
+    results: Path = RESULTS
+    """Folder to read the records from."""
     out: Path | None = None
-    """Also write the table into this folder."""
+    """Folder to write the table to; it is only printed when not given."""
 
     def run(self) -> None:
         from wbc_bench.files import ensure_writable
         from wbc_bench.results.analysis import collect
-        from wbc_bench.results.store import ResultStore
         from wbc_bench.results.tables.pairs import compare_table
         from wbc_bench.results.tables.write import write_compare_table
 
-        evaluated = collect(ResultStore(self.results).runs(self.protocol))
+        evaluated = collect(open_records(self.results).runs(self.protocol))
         print_table(compare_table(self.protocol, evaluated, self.a, self.b))
         if self.out:
             ensure_writable(self.out)
@@ -43,18 +42,18 @@ class Compare:
 class Report:
     """Make every table, every figure and report.html anew from the records; nothing is evaluated."""
 
-    results: Path = Path("results")
-    """Folder of the records."""
+    results: Path = RESULTS
+    """Folder to read the records from."""
     out: Path | None = None
-    """Where to write; the folder of the records when not given."""
+    """Folder to write tables, figures and report.html to; the folder of the records when not given."""
     workspace: tuple[str, ...] = ()
-    """Controllers whose success over the workspace is drawn side by side; the best two when not given."""
+    """Controllers whose success over the workspace is drawn side by side; the two with the highest success
+    when not given."""
 
     def run(self) -> None:
         from wbc_bench.publish import publish
-        from wbc_bench.results.store import ResultStore
 
-        for path in publish(ResultStore(self.results), self.out or self.results, self.workspace):
+        for path in publish(open_records(self.results), self.out or self.results, self.workspace):
             print(path)
 
 
@@ -63,15 +62,15 @@ class Latent:
     """Draw the latent of a controller's estimator by phase of the task: t-SNE and LDA side by side."""
 
     controller: str = tyro.MISSING
-    """Controller that shows its latent, e.g. learned:METHOD@SEED."""
+    """Controller that has a latent, e.g. learned:METHOD@SEED."""
     protocol: str = "ablation_v1"
-    """Name of a released protocol, or a .toml file with its manifest beside it."""
+    """Name of a released protocol, or path of a .toml file with its manifest beside it."""
     episodes: int = 40
-    """First episodes of replicate 0; half of them are held out to test the discriminant."""
+    """Number of episodes, the first ones of replicate 0; half of them are held out to test LDA."""
     seed: int = 0
-    """Of the halves, of the points drawn and of t-SNE."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("results/figures")
-    """Folder of the figure and its numbers; a report beside it shows them."""
+    """Seed of the split into halves, of the choice of the points drawn and of t-SNE."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = RESULTS / "figures"
+    """Folder to write the figure and its numbers to; the report of the folder above shows them."""
 
     def run(self) -> None:
         from wbc_bench.episodes.manifest import manifest_path, read_manifest

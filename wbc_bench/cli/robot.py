@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class _Robot:
     mount: str = ""
-    """Where the arm stands; the default of the facts file when not given."""
+    """Name of the place where the arm is mounted; the default of the robot's facts file when not given."""
     tcp: str = ""
-    """End-effector frame."""
+    """Name of the end-effector frame; the default of the robot's facts file when not given."""
     ankle_effort: float | None = None
-    """Torque limit of the ankles [N m]."""
+    """Torque limit of the ankles [N m]; that of the robot's facts file when not given."""
 
     def _config(self) -> "RobotConfig":
         from wbc_bench.robot import RobotConfig
@@ -30,7 +30,7 @@ class Export(_Robot):
     """Write the robot as MuJoCo XML and as URDF."""
 
     out: Path = tyro.MISSING
-    """Folder to write to."""
+    """Folder to write the XML file and the URDF file to."""
 
     def run(self) -> None:
         from wbc_bench.files import ensure_writable, write_atomic
@@ -51,7 +51,7 @@ class Picture(_Robot):
     """Draw the robot in its default posture."""
 
     out: Path = Path("robot.png")
-    """Picture to write."""
+    """Path of the picture to write, FILE.png."""
 
     def run(self) -> None:
         from wbc_bench.files import ensure_writable

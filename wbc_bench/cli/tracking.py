@@ -12,7 +12,7 @@ from wbc_bench.errors import UnknownNameError
 
 if TYPE_CHECKING:
     from wbc_bench.results.tracking import Tracked
-from wbc_bench.cli.common import UsageError, check_port, host, not_negative, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, check_port, host, not_negative, print_table
 
 
 @dataclass(frozen=True)
@@ -20,24 +20,26 @@ class Track:
     """Let controllers follow moving targets, one simulated episode each, and score how."""
 
     controller: tuple[str, ...] = tyro.MISSING
-    """Controllers: name, name:variant, module:attribute or file.py:attribute."""
+    """Controllers to score, each a name, name:variant, module:attribute or file.py:attribute."""
     source: tuple[str, ...] = tyro.MISSING
-    """Sources: a script of the library, a .toml file, `stream`, `stream:SCRIPT` to send one through it,
-    `diffusion[:FILE]`, a policy in front of a door, or `live`, a person who drags the target in a page."""
+    """Sources of the target, each the name of a released script, the path of a .toml file, `stream`,
+    `stream:SCRIPT` to send a script through a stream, `diffusion[:FILE]` for a policy in front of a door, or
+    `live` for a person who drags the target in a page."""
     duration: float | None = None
-    """Seconds; until the script ends when not given, 20 for other sources."""
+    """Duration of each episode [s]; when not given, that of the script, and 20 s for other sources."""
     seed: int = 0
-    """Of the draws of a randomised episode, and of the door."""
+    """Seed of the draws of a randomised episode, and of the door."""
     condition: str = "nominal"
-    """nominal, or randomised: friction, mass, gains, reset state, pushes and noise of ablation_v1."""
+    """Condition of the episodes: nominal, or randomised (friction, mass, gains, reset state, pushes and noise
+    of ablation_v1)."""
     address: str = "tcp://127.0.0.1:5601"
-    """Where a stream listens."""
+    """ZeroMQ address at which a stream listens."""
     port: int = 8080
-    """Of the page of `live`."""
+    """TCP port of the page of `live`, 1 to 65535."""
     allow_remote: FlagCreatePairsOff[bool] = False
     """Let other machines reach the stream or the page, and move the robot."""
-    out: Path = Path("results")
-    """Folder of records, table and figure."""
+    out: Path = RESULTS
+    """Folder to write records, table and figure to."""
 
     def run(self) -> None:
         from wbc_bench.episodes.single import CONDITIONS
@@ -114,17 +116,18 @@ class Live:
     """Watch a controller in the browser, in real time, and drag its target."""
 
     controller: str = tyro.MISSING
-    """Controller: name, name:variant, module:attribute or file.py:attribute."""
+    """Controller to watch: name, name:variant, module:attribute or file.py:attribute."""
     source: str = "live"
-    """live: the target is dragged in the page. Otherwise a source as `track` takes it."""
+    """Source of the target: `live`, where it is dragged in the page, or any other that `track` takes."""
     protocol: str = "ablation_v1"
-    """Protocol whose physics, randomisation, noise and limits hold."""
+    """Name of a protocol, or path of its .toml file, whose physics, randomisation, noise and limits apply."""
     condition: str = "nominal"
-    """nominal, or randomised: friction, mass, gains, reset state and noise of the protocol."""
+    """Condition of the episode: nominal, or randomised (friction, mass, gains, reset state and noise of the
+    protocol)."""
     seed: int = 0
-    """Of the draws of a randomised episode."""
+    """Seed of the draws of a randomised episode."""
     port: int = 8080
-    """Of the page."""
+    """TCP port of the page, 1 to 65535."""
     allow_remote: FlagCreatePairsOff[bool] = False
     """Let other machines open the page, and move the robot."""
 

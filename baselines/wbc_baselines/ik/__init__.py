@@ -18,18 +18,38 @@ CHANGES: dict[str, dict[str, bool]] = {  # to the tuned configuration
     "osqp": {},
     "standing": {"stepping": False},
 }
+DESCRIPTIONS = {
+    "": "Whole-body inverse kinematics that takes steps; its quadratic program is solved by PlaCo.",
+    "kinematic": "The inverse kinematics alone: no feed-forward, no feedback, no steps.",
+    "osqp": "The same quadratic program as `ik`, on Pinocchio and OSQP.",
+    "standing": "As `ik`, but no foot is ever lifted.",
+}
 VARIANTS = tuple(CHANGES)
 
 
-def make(robot: Robot, variant: str = "") -> IKController:
-    """The controller of a variant. Raises: UnknownNameError."""
-    if variant not in VARIANTS:
-        raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
-    config = replace(TUNED, **CHANGES[variant])
-    # imported here: each solver is needed only by its own variant
-    if variant == "osqp":
-        from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
-    else:
-        from wbc_baselines.ik.placo_ik import PlacoIK as Solver
-    name = f"ik:{variant}" if variant else "ik"
-    return IKController(robot, Solver(robot, config.weights, PERIOD), config, name)
+class IK:
+    """The entry point of the inverse-kinematics controllers."""
+
+    def __call__(self, robot: Robot, variant: str = "") -> IKController:
+        """Create the controller of a variant.
+
+        Raises:
+            UnknownNameError: There is no such variant.
+        """
+        if variant not in VARIANTS:
+            raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
+        config = replace(TUNED, **CHANGES[variant])
+        # imported here: each solver is needed only by its own variant
+        if variant == "osqp":
+            from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
+        else:
+            from wbc_baselines.ik.placo_ik import PlacoIK as Solver
+        name = f"ik:{variant}" if variant else "ik"
+        return IKController(robot, Solver(robot, config.weights, PERIOD), config, name)
+
+    def variants(self) -> list[tuple[str, str]]:
+        """Return every variant with its description."""
+        return [(variant, DESCRIPTIONS[variant]) for variant in VARIANTS]
+
+
+make = IK()

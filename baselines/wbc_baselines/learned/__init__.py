@@ -4,8 +4,22 @@
 `learned:METHOD` stands for all seeds of a method: replicate k of a protocol is evaluated with seed k.
 """
 
+from pathlib import Path
+
+import msgspec
+
 from wbc_bench.controller import Controller
 from wbc_bench.robot import Robot
+
+CHECKPOINTS = Path(__file__).with_name("checkpoints")  # METHOD@SEED.safetensors and .json
+
+
+class _Training(msgspec.Struct, frozen=True):
+    """What `variants` reads of a `policy.card.PolicyCard`, whose module imports torch."""
+
+    method: str
+    seed: int
+    samples: int  # control steps of training
 
 
 class Learned:
@@ -22,12 +36,36 @@ class Learned:
         one = "@" in variant or variant.endswith(".safetensors")
         return variant if one else f"{variant}@{replicate}"
 
+    def variants(self) -> list[tuple[str, str]]:
+        """Return METHOD and METHOD@SEED of every packaged checkpoint, and how long each was trained."""
+        paths = sorted(CHECKPOINTS.glob("*@*.json"))
+        cards = [msgspec.json.decode(path.read_bytes(), type=_Training) for path in paths]
+        seeds: dict[str, list[_Training]] = {}
+        for card in cards:
+            seeds.setdefault(card.method, []).append(card)
+        found = []
+        for method, trained in seeds.items():
+            numbers = ", ".join(str(card.seed) for card in trained)
+            found.append((method, f"Replicate k is evaluated with training seed k, one of: {numbers}."))
+            for card in trained:
+                budget = f"{card.samples:,} control steps of training"
+                found.append((f"{method}@{card.seed}", f"Training seed {card.seed}, {budget}."))
+        return [*found, ("FILE.safetensors", "A checkpoint of your own, see `wbc-train`.")]
 
-def make_onnx(robot: Robot, variant: str = "") -> Controller:
-    """Create the controller of an exported file `onnx:FILE`, see `policy.controller.from_onnx`."""
-    from wbc_baselines.learned.policy.controller import from_onnx
 
-    return from_onnx(robot, variant)
+class Onnx:
+    """The entry point of exported controllers; onnxruntime is imported only when one is created."""
+
+    def __call__(self, robot: Robot, variant: str = "") -> Controller:
+        """Create the controller of an exported file `onnx:FILE`, see `policy.controller.from_onnx`."""
+        from wbc_baselines.learned.policy.controller import from_onnx
+
+        return from_onnx(robot, variant)
+
+    def variants(self) -> list[tuple[str, str]]:
+        """Return the form of a variant, with its description."""
+        return [("FILE.onnx", "A learned controller that `wbc-bench export` wrote.")]
 
 
 make = Learned()
+make_onnx = Onnx()
