@@ -85,7 +85,7 @@ def test_what_cannot_be_separated_is_one_line():
 
 def test_without_scikit_learn_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "sklearn.discriminant_analysis", None)
-    with pytest.raises(LatentError, match=r"pip install wbc-bench\[figures\]"):
+    with pytest.raises(LatentError, match=r"scikit-learn: pip install 'wbc-bench\[figures\]'"):
         latents.separate(synthetic(1.0), np.random.default_rng(0))
 
 

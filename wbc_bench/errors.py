@@ -44,6 +44,28 @@ class SourceError(BenchError):
     """A source of targets that cannot be read or opened, or a target that is none."""
 
 
+_PACKAGES = {  # distribution of a module that has another name
+    "imageio_ffmpeg": "imageio-ffmpeg",
+    "pink": "pin-pink",
+    "pinocchio": "pin",
+    "sklearn": "scikit-learn",
+    "zmq": "pyzmq",
+}
+
+
+def missing_extra(what: str, extra: str, error: ImportError) -> str:
+    """An import that failed because an optional part is not installed, in one line with the remedy.
+
+    Args:
+        what: The thing that cannot be used, e.g. "a film".
+        extra: Optional dependency group of wbc-bench that brings the package.
+        error: The failed import.
+    """
+    module = (error.name or "").partition(".")[0]
+    package = f"the package {_PACKAGES.get(module, module)}" if module else "more packages"
+    return f"{what} needs {package}: pip install 'wbc-bench[{extra}]' ({error})"
+
+
 def fault_of(error: BaseException) -> str:
     """An exception of somebody else's code in one line, with the frames that lead to it.
 

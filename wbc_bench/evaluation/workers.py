@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
+from wbc_bench.errors import BenchError, ControllerError, UnknownNameError, missing_extra
 from wbc_bench.evaluation.shard import evaluate_shard
 from wbc_bench.results.store import ShardCost
 
@@ -146,9 +146,7 @@ def _on_dask(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
     try:
         from distributed import Client, KilledWorker, LocalCluster, as_completed
     except ImportError as error:
-        raise ExecutionError(
-            "--engine dask needs the package distributed: pip install wbc-bench[cluster]"
-        ) from error
+        raise ExecutionError(missing_extra("--engine dask", "cluster", error)) from error
     with ExitStack() as stack:
         if engine.address is None:
             options: Any = {"dashboard_address": None}  # no web server

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.errors import BenchError
+from wbc_bench.errors import BenchError, missing_extra
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import FloatArray
@@ -131,6 +131,4 @@ def _sklearn(module: str):
     try:
         return importlib.import_module(f"sklearn.{module}")
     except ImportError as error:
-        raise LatentError(
-            f"the latent's picture needs scikit-learn: pip install wbc-bench[figures] ({error})"
-        ) from error
+        raise LatentError(missing_extra("the picture of a latent", "figures", error)) from error

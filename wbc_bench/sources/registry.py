@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
-from wbc_bench.errors import SourceError, UnknownNameError
+from wbc_bench.errors import SourceError, UnknownNameError, missing_extra
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.sources.interface import Source
 from wbc_bench.sources.live import LIVE, LiveSource
@@ -61,10 +61,10 @@ def load_source(
     Raises: UnknownNameError (with the nearest names), SourceError.
     """
     if _is_diffusion(name):
+        policy, _, digest = find_policy(name.partition(":")[2])  # first: it says what is not installed
         from wbc_bench.sources.diffusion.scene import draw_door
         from wbc_bench.sources.diffusion.source import DiffusionSource
 
-        policy, _, digest = find_policy(name.partition(":")[2])
         protocol = protocol or find_protocol("ablation_v1")[0]
         seed = protocol.episodes.seed
         return DiffusionSource(policy, draw_door(protocol, seed, 0), seed, digest=digest)
@@ -86,9 +86,7 @@ def find_policy(file: str = "") -> "tuple[Policy, DoorPolicyCard, str]":
     try:
         from wbc_bench.sources.diffusion.policy import load_policy
     except ImportError as error:
-        raise SourceError(
-            "a diffusion policy needs torch and safetensors: pip install 'wbc-bench[diffusion]'"
-        ) from error
+        raise SourceError(missing_extra("a diffusion policy", "diffusion", error)) from error
     return load_policy(Path(file) if file else POLICY)
 
 

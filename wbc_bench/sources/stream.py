@@ -3,7 +3,7 @@
 import ipaddress
 from collections.abc import Mapping
 
-from wbc_bench.errors import SourceError
+from wbc_bench.errors import SourceError, missing_extra
 from wbc_bench.sources.interface import Seen, StampedTarget
 from wbc_bench.sources.stream_filter import Status, StreamConfig, StreamFilter
 
@@ -60,7 +60,7 @@ class StreamSource:
         try:
             import zmq
         except ImportError as error:
-            raise SourceError("a stream needs pyzmq: pip install 'wbc-bench[live]'") from error
+            raise SourceError(missing_extra("a stream", "live", error)) from error
         self._zmq = zmq
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.PULL)

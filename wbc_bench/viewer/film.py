@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.errors import BenchError, StoreError
+from wbc_bench.errors import BenchError, StoreError, missing_extra
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 from wbc_bench.viewer.picture import Canvas, add_axes, add_bones, add_connector
@@ -37,7 +37,7 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
     try:
         from imageio_ffmpeg import write_frames
     except ImportError as error:
-        raise BenchError("a film needs imageio-ffmpeg: pip install 'wbc-bench[film]'") from error
+        raise BenchError(missing_extra("a film", "film", error)) from error
     part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     rate = 1 / (EVERY * again.protocol.control_period)  # [1/s]
     shown = range(0, len(again.moments), EVERY)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.episodes.protocol import Success
-from wbc_bench.errors import BenchError
+from wbc_bench.errors import BenchError, missing_extra
 from wbc_bench.robot import Robot, Scene
 from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
@@ -40,7 +40,7 @@ def serving(host: str = "127.0.0.1", port: int = 8080) -> Iterator[Any]:
     try:
         import viser
     except ImportError as error:
-        raise BenchError("this needs viser: pip install 'wbc-bench[view]'") from error
+        raise BenchError(missing_extra("a page of the robot", "view", error)) from error
     with redirect_stdout(io.StringIO()):  # its banner, whatever `verbose` says
         try:
             server = viser.ViserServer(host=host, port=port, verbose=False)

@@ -6,11 +6,14 @@ feed-forward and feedback: what is left is the whole-body IK alone) and
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from wbc_baselines.ik.config import TUNED
-from wbc_baselines.ik.controller import PERIOD, IKController
-from wbc_bench.errors import UnknownNameError
+from wbc_bench.errors import ControllerError, UnknownNameError, missing_extra
 from wbc_bench.robot import Robot
+
+if TYPE_CHECKING:
+    from wbc_baselines.ik.controller import IKController
 
 CHANGES: dict[str, dict[str, bool]] = {  # to the tuned configuration
     "": {},
@@ -30,21 +33,27 @@ VARIANTS = tuple(CHANGES)
 class IK:
     """The entry point of the inverse-kinematics controllers."""
 
-    def __call__(self, robot: Robot, variant: str = "") -> IKController:
+    def __call__(self, robot: Robot, variant: str = "") -> "IKController":
         """Create the controller of a variant.
 
         Raises:
             UnknownNameError: There is no such variant.
+            ControllerError: A solver is not installed.
         """
         if variant not in VARIANTS:
             raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
         config = replace(TUNED, **CHANGES[variant])
-        # imported here: each solver is needed only by its own variant
-        if variant == "osqp":
-            from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
-        else:
-            from wbc_baselines.ik.placo_ik import PlacoIK as Solver
         name = f"ik:{variant}" if variant else "ik"
+        # imported here: each solver is needed only by its own variant
+        try:
+            from wbc_baselines.ik.controller import PERIOD, IKController
+
+            if variant == "osqp":
+                from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
+            else:
+                from wbc_baselines.ik.placo_ik import PlacoIK as Solver
+        except ImportError as error:
+            raise ControllerError(missing_extra(f"controller '{name}'", "ik", error)) from error
         return IKController(robot, Solver(robot, config.weights, PERIOD), config, name)
 
     def variants(self) -> list[tuple[str, str]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from wbc_bench.controller import Controller
+from wbc_bench.errors import ControllerError, missing_extra
 from wbc_bench.robot import Robot
 
 CHECKPOINTS = Path(__file__).with_name("checkpoints")  # METHOD@SEED.safetensors and .json
@@ -27,7 +28,10 @@ class Learned:
 
     def __call__(self, robot: Robot, variant: str = "") -> Controller:
         """Create the controller of a checkpoint, see `policy.controller.from_checkpoint`."""
-        from wbc_baselines.learned.policy.controller import from_checkpoint
+        try:
+            from wbc_baselines.learned.policy.controller import from_checkpoint
+        except ImportError as error:
+            raise ControllerError(missing_extra("a learned controller", "learned", error)) from error
 
         return from_checkpoint(robot, variant)
 
@@ -58,8 +62,10 @@ class Onnx:
 
     def __call__(self, robot: Robot, variant: str = "") -> Controller:
         """Create the controller of an exported file `onnx:FILE`, see `policy.controller.from_onnx`."""
-        from wbc_baselines.learned.policy.controller import from_onnx
-
+        try:
+            from wbc_baselines.learned.policy.controller import from_onnx
+        except ImportError as error:
+            raise ControllerError(missing_extra("an exported policy", "learned", error)) from error
         return from_onnx(robot, variant)
 
     def variants(self) -> list[tuple[str, str]]:

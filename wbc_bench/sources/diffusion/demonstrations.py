@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.errors import SourceError
+from wbc_bench.errors import SourceError, missing_extra
 from wbc_bench.files import write_atomic
 from wbc_bench.rotations import matrix_from_rotvec, rotvec_from_matrix
 from wbc_bench.sources.diffusion import poses
@@ -156,5 +156,5 @@ def _zarr() -> Any:
         import zarr
         import zarr.storage
     except ImportError as error:
-        raise SourceError("demonstrations need zarr: pip install 'wbc-bench[diffusion]'") from error
+        raise SourceError(missing_extra("a file of demonstrations", "diffusion", error)) from error
     return zarr
