@@ -1,9 +1,12 @@
 """Tables: numbers against hand arithmetic, counts that add up, text that says what is missing."""
 
+import io
+
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from rich.console import Console
 from synthetic import FakeRun, FakeStore, frame_of, methods_in, reach_store, record, study_store
 
 from wbc_bench.errors import StoreError, UnknownNameError
@@ -165,13 +168,37 @@ def test_markdown_survives_a_round_trip(tmp_path):
 
 
 def test_latex_is_escaped_and_balanced():
-    text = paper_table(ABLATION, methods_in(study_store())).latex()
+    packages, text = paper_table(ABLATION, methods_in(study_store())).latex().split("\n", 1)
+    assert packages == r"% needs \usepackage{booktabs} and \usepackage{graphicx}"
     body = text.replace(r"\%", "").replace(r"\_", "").replace(r"\&", "")
     assert "%" not in body and "±" not in text and "↑" not in text
     assert text.isascii()
     assert text.count(r"\begin{") == text.count(r"\end{") == 2
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert {line.replace(r"\&", "").count("&") for line in rows} == {9}
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 300])
+def test_a_terminal_shows_every_number_and_name(width):
+    methods = methods_in(study_store())
+    for table in (
+        paper_table(ABLATION, methods),
+        outcome_table(ABLATION, methods),
+        pair_table(ABLATION, methods),
+    ):
+        output = io.StringIO()
+        Console(file=output, width=width).print(table.rich())
+        lines = output.getvalue().splitlines()
+        assert max(map(len, lines)) <= width and "…" not in output.getvalue()
+        shown = [[cell.strip() for cell in line.split("│")] for line in lines]
+        cells = {cell for line in shown for cell in line}
+        names = next(k for k, number in enumerate(table.numeric) if number)
+        for row in table.rows:
+            assert set(row[names:]) <= cells  # whole, in one line
+            for name in row[:names]:
+                # a name may go over two lines of its column
+                assert set("".join(name.split())) <= set(output.getvalue())
+                assert name in cells or width < 120
 
 
 def test_same_store_same_bytes(tmp_path):
