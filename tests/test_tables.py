@@ -137,7 +137,9 @@ def test_outcomes_add_up():
 
 def test_pairs_are_the_studys_own_and_use_the_same_episodes():
     table = pair_table(ABLATION, methods_in(study_store()))
-    assert list(table.data["A vs B".lower()]) == ["ik vs hold", "ik vs ik:kinematic", "ik vs ik:osqp"]
+    assert list(table.data["A vs B".lower()]) == [
+        f"Whole-body IK vs {name}" for name in ("Hold posture", "IK, kinematic only", "IK on OSQP")
+    ]
     first = table.data.iloc[0]
     assert first["success_diff_pp"] > 0 and first["success_p_holm"] >= first["success_p"]
     frames = [methods_in(study_store())[spec].episodes for spec in ("ik", "hold")]
@@ -257,7 +259,7 @@ def test_oscillation_near_the_ends():
 
 def test_reach_table_has_the_papers_ranges_and_the_grid():
     table = reach_table(REACH, methods_in(reach_store(), "reach_v1"))
-    assert [row[4] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
+    assert [row[5] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
     assert len(height_table(REACH, methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41
 
 
@@ -266,7 +268,7 @@ def test_the_rule_that_is_printed_and_applied_is_that_of_the_records():
     frame = heights([1, 3, 1, 1])
     methods = methods_in(FakeStore([FakeRun(record("ik", 0, frame, rule=rule), frame)]))
     reach = reach_table(REACH, methods)
-    assert reach.rows[-1][4] == "10–15"  # 3 cm is not within 2 cm
+    assert reach.rows[-1][5] == "10–15"  # 3 cm is not within 2 cm
     for table in (reach, paper_table(ABLATION, methods), height_table(REACH, methods["ik"])):
         text = " ".join(table.notes)
         assert "final 0.5 s" in text and "1 s" not in text.replace("0.5 s", "") and "5 cm" not in text

@@ -34,6 +34,12 @@ class Evaluated:
     spec: str
     records: tuple[Any, ...]
     episodes: pd.DataFrame  # the episode record, replicates concatenated
+    label: str = ""  # what the studies call it
+
+    @property
+    def name(self) -> str:
+        """Its label, or its spec where no study lists it."""
+        return self.label or self.spec
 
     @property
     def requested(self) -> int:
@@ -66,8 +72,10 @@ class Evaluated:
         return stood(self.episodes)
 
 
-def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
+def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) -> dict[str, Evaluated]:
     """Spec -> its runs, sorted by spec, of runs under one protocol; reads their episodes, so call it once.
+
+    `labels` maps a spec to its name in tables and figures.
 
     Raises: StoreError when two runs under one name were evaluated with different protocols or manifests.
     """
@@ -93,12 +101,15 @@ def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
             spec,
             tuple(run.record for run in group),
             pd.concat([run.episodes() for run in group], ignore_index=True),
+            (labels or {}).get(spec, ""),
         )
         for spec, group in grouped.items()
     }
 
 
-def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
+def collect_all(
+    runs: Iterable[RunLike], labels: Mapping[str, str] | None = None
+) -> dict[str, dict[str, Evaluated]]:
     """Protocol -> spec -> its runs, both sorted; every file of episodes is read once.
 
     Raises: StoreError, see `collect`.
@@ -106,7 +117,7 @@ def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
     grouped: dict[str, list[RunLike]] = {}
     for run in sorted(runs, key=lambda run: run.record.protocol):
         grouped.setdefault(run.record.protocol, []).append(run)
-    return {protocol: collect(group) for protocol, group in grouped.items()}
+    return {protocol: collect(group, labels) for protocol, group in grouped.items()}
 
 
 def rule_of(evaluated: Mapping[str, Evaluated]) -> SuccessRule:

@@ -2,6 +2,7 @@
 
 import html
 import re
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,10 +55,10 @@ class Table:
                 r"\centering",
                 rf"\caption{{{_latex(self.title)}}}",
                 rf"\label{{tab:{self.name}}}",
-                r"\footnotesize",
+                r"\footnotesize\setlength{\tabcolsep}{3pt}",
                 rf"{fit}\begin{{tabular}}{{{''.join('r' if number else 'l' for number in self.numeric)}}}",
                 r"\toprule",
-                " & ".join(rf"\textbf{{{_latex(cell)}}}" for cell in self.header) + r" \\",
+                " & ".join(map(self._latex_header, range(len(self.header)))) + r" \\",
                 r"\midrule",
                 *body,
                 r"\bottomrule",
@@ -67,6 +68,13 @@ class Table:
                 "",
             ]
         )
+
+    def _latex_header(self, k: int) -> str:
+        """The header of a column, over as many lines as keep it about as narrow as the cells."""
+        width = max([8, *(len(row[k]) for row in self.rows)])  # characters; no column is narrower
+        lines = textwrap.wrap(self.header[k], width, break_long_words=False) or [""]
+        stacked = r" \\ ".join(rf"\textbf{{{_latex(line)}}}" for line in lines)
+        return rf"\shortstack[{'r' if self.numeric[k] else 'l'}]{{{stacked}}}"
 
     def csv(self) -> str:
         # Six digits: the last bits of a mean depend on the vector width of the processor.

@@ -140,7 +140,7 @@ def reach_figure(study: Study, method: Evaluated) -> Figure:
         handles, labels = [*handles, Patch(color=SHADE)], [*labels, "no feasible pose at this height"]
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     figure.suptitle(
-        f"{method.spec}: vertical reach ({method.counts} episodes)", x=0.01, ha="left", weight="bold"
+        f"{method.name}: vertical reach ({method.counts} episodes)", x=0.01, ha="left", weight="bold"
     )
     return figure
 

@@ -110,10 +110,11 @@ def _compare_table(name: str, title: str, first: str, results: list[dict[str, An
 
 def pair_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
     """The study's pairs of methods on the episodes both of them met."""
-    specs = [method.spec for _, method in methods_of(study, evaluated)]
+    labels = {method.spec: label for label, method in methods_of(study, evaluated)}
+    specs = list(labels)
     pairs = study.pairs or [(a, b) for k, a in enumerate(specs) for b in specs[k + 1 :]]
     known = [
-        (f"{a} vs {b}", evaluated[a], evaluated[b], None)
+        (f"{labels[a]} vs {labels[b]}", evaluated[a], evaluated[b], None)
         for a, b in pairs
         if a in evaluated and b in evaluated
     ]

@@ -21,6 +21,7 @@ from wbc_bench.results.formatting import (
     CM,
     DEG,
     NONE,
+    names_note,
     spread_text,
     tolerance_text,
     window_text,
@@ -134,6 +135,7 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
     else:
         name, title = study.name, f"{study.name}: errors over episodes that did not terminate"
         notes = _paper_notes(study, evaluated)
+    notes += names_note({spec: method.name for spec, method in evaluated.items()})
     if marks:
         notes.append(
             "† reads more than the paper's policy: " + "; ".join(f"{m}: {s}" for m, s in marks.items()) + "."
