@@ -121,7 +121,7 @@ def test_nothing_is_computed_twice(tiny, reference, tmp_path, monkeypatch, capsy
     run_jobs([job(tiny, spec)], ResultStore(tmp_path), Engine())
     monkeypatch.setattr(workers_module, "evaluate_shard", None)
     run_jobs([job(tiny, spec)], ResultStore(tmp_path), Engine())
-    assert "kept" in capsys.readouterr().err
+    assert "reused" in capsys.readouterr().err
 
 
 def test_a_killed_worker_costs_only_time(tiny, reference, tmp_path):

@@ -67,7 +67,7 @@ def test_outcome_bars_add_up_to_100():
 def test_a_cdf_ends_at_the_share_that_stood():
     ax = error_cdf(Figure().subplots(), methods(), "position_error")
     for line, (_, method) in zip(ax.get_lines(), methods(), strict=False):
-        assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.stood.mean())
+        assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.not_terminated.mean())
 
 
 def test_a_controller_keeps_its_colour_whoever_else_is_drawn():

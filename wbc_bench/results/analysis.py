@@ -68,8 +68,8 @@ class Evaluated:
         return any(record.checkpoint_sha256 for record in self.records)
 
     @property
-    def stood(self) -> Mask:
-        return stood(self.episodes)
+    def not_terminated(self) -> Mask:
+        return not_terminated(self.episodes)
 
 
 def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) -> dict[str, Evaluated]:
@@ -135,7 +135,7 @@ def subset(episodes: pd.DataFrame, mask: Mask) -> pd.DataFrame:
     return episodes.take(np.flatnonzero(mask))
 
 
-def stood(episodes: pd.DataFrame) -> Mask:
+def not_terminated(episodes: pd.DataFrame) -> Mask:
     """Which episodes did not terminate, (N,)."""
     return ~np.isin(np.asarray(episodes["outcome"], dtype=str), [str(outcome) for outcome in TERMINATED])
 
@@ -161,10 +161,12 @@ class HeightRange(NamedTuple):
 def reached(episodes: pd.DataFrame, rule: SuccessRule) -> bool:
     """Whether the median error over the episodes of one height is below the tolerance of success.
 
-    A terminated episode, or one without a value, counts as infinitely far; so more than half must have stood.
+    A terminated episode, or one without a value, counts as infinitely far: fewer than half may.
     """
     error = column(episodes, "position_error")
-    return bool(np.median(np.where(stood(episodes) & ~np.isnan(error), error, np.inf)) < rule.position)
+    return bool(
+        np.median(np.where(not_terminated(episodes) & ~np.isnan(error), error, np.inf)) < rule.position
+    )
 
 
 def by_height(episodes: pd.DataFrame) -> list[tuple[float, pd.DataFrame]]:
@@ -197,11 +199,11 @@ def reach_range(episodes: pd.DataFrame, rule: SuccessRule, strict: bool = False)
 
 
 def oscillation(episodes: pd.DataFrame, span: HeightRange, metric: str) -> tuple[float, float, float]:
-    """Median of a metric over episodes that stood: near the low end of a range, between, near the high end.
+    """Median of a metric near the low end of a range, between, and near the high end.
 
-    Near is within END_ZONE on either side, so also just outside of the range.
+    Terminated episodes are left out. Near is within END_ZONE on either side, so also just outside the range.
     """
-    kept = subset(episodes, stood(episodes))
+    kept = subset(episodes, not_terminated(episodes))
     height, values = column(kept, "height"), column(kept, metric)
     zone = END_ZONE + 1e-6  # the grid went through floating point
     low, high = np.abs(height - span.low) <= zone, np.abs(height - span.high) <= zone

@@ -1,4 +1,4 @@
-"""What pushing doors shut leaves behind: a row an episode, a record of the run, and the table of them.
+"""What pushing doors shut leaves behind: a row per episode, a record of the run, and the table of them.
 
 <root>/doors/<source>/<controller>/<condition>_<seed>/run.json, episodes.parquet
 """

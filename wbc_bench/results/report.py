@@ -114,7 +114,7 @@ class _Sidecar(msgspec.Struct):
 
 
 def provenance_html(records: list[Any]) -> str:
-    """One row a run, and under it the machines and versions that occur, each once."""
+    """One row per run, and under it the machines and versions that occur, each once."""
     header = ("Protocol", "Controller", "Replicate", "Completed", "Protocol digest", "Manifest sha256")
     header += ("Checkpoint", "Commit", "Created (UTC)", "Wall time (s)", "Workers", "Setup")
     setups: dict[tuple[str, str], str] = {}

@@ -44,7 +44,7 @@ class Tracked:
 
 
 class Series:
-    """Collects a run, a control step at a time."""
+    """Collects a run step by step."""
 
     def __init__(self, control_period: float) -> None:
         self._period = control_period  # [s]
@@ -73,7 +73,7 @@ class Series:
 
 
 class Scores(NamedTuple):
-    """One number a run; errors over the steps completed, the rest NaN unless the robot stood to the end."""
+    """One number per run; errors over the steps completed, the rest NaN unless the robot stood to the end."""
 
     position_mean: float  # [m]
     position_p95: float  # [m]

@@ -82,7 +82,7 @@ def error_cdf(
     metric: str,
     colours: Mapping[str, str] | None = None,
 ) -> Axes:
-    """Share of all episodes [%] that stood with an error up to x; what is missing to 100 % terminated."""
+    """Share of all episodes [%] with an error up to x; what is missing to 100 % terminated."""
     colours = colours or controller_colours({method.spec: label for label, method in methods})
     rule = rule_of({method.spec: method for _, method in methods})
     scale, unit, tolerance = {
@@ -91,7 +91,7 @@ def error_cdf(
     }[metric]
     ticks, (left, right) = (0.5, 1, 2, 5, 10, 20, 50, 100), (0.3, 200.0)
     for k, (label, method) in enumerate(methods):
-        error = column(method.episodes, metric)[method.stood] * scale
+        error = column(method.episodes, metric)[method.not_terminated] * scale
         error = np.sort(error[~np.isnan(error)])
         share = 100.0 * np.arange(1, len(error) + 1) / method.completed
         # A thousand points draw the same curve as three thousand, in a third of the bytes.

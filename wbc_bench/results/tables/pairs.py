@@ -32,8 +32,8 @@ def _compare_rows(pairs: Sequence[tuple[str, Evaluated, Evaluated, str | None]])
     results, tests = [], []
     for name, a, b, stratum in pairs:
         both = pd.merge(
-            a.episodes.assign(stood=a.stood),
-            b.episodes.assign(stood=b.stood),
+            a.episodes.assign(not_terminated=a.not_terminated),
+            b.episodes.assign(not_terminated=b.not_terminated),
             on=["replicate", "episode"],
             suffixes=("_a", "_b"),
             validate="one_to_one",
@@ -41,7 +41,7 @@ def _compare_rows(pairs: Sequence[tuple[str, Evaluated, Evaluated, str | None]])
         if stratum is not None:
             both = subset(both, np.asarray(both["stratum_a"] == stratum))
         seeds = len(np.unique(series(both, "replicate")))
-        neither = subset(both, np.asarray(both["stood_a"] & both["stood_b"], dtype=bool))
+        neither = subset(both, np.asarray(both["not_terminated_a"] & both["not_terminated_b"], dtype=bool))
         result: dict[str, Any] = {"name": name, "a": a.spec, "b": b.spec}
         result |= {"episodes": len(both), "both_stood": len(neither)}
         p_values = dict.fromkeys(("success", "position_error", "orientation_error"), float("nan"))

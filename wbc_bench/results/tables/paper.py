@@ -1,6 +1,6 @@
 """The paper's Table III from the records of a study.
 
-The text of a cell is what a reader needs; the CSV holds the same numbers in full and one unit a column.
+The text of a cell is what a reader needs; the CSV holds the same numbers in full and one unit per column.
 """
 
 from collections.abc import Mapping
@@ -107,7 +107,7 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
             rows.append((group, row.label, note, *[NONE] * (len(COLUMNS) + 1)))
             data.append({**base, "source": "measured", "note": note})
         else:
-            over = method.stood | terminated
+            over = method.not_terminated | terminated
             values = columns_over_replicates(method, over)
             if method.extra_signals:
                 marks[row.label] = ", ".join(method.extra_signals)

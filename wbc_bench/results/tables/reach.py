@@ -13,11 +13,11 @@ from wbc_bench.results.analysis import (
     HeightRange,
     by_height,
     median,
+    not_terminated,
     oscillation,
     reach_range,
     reached,
     rule_of,
-    stood,
     strata_of,
     subset,
     variants,
@@ -105,7 +105,7 @@ def height_table(study: Study, method: Evaluated) -> Table:
                 cells += [NONE, NONE]
                 continue
             episodes = groups[height]
-            kept = subset(episodes, stood(episodes))
+            kept = subset(episodes, not_terminated(episodes))
             rate = stats.wilson(int(series(episodes, "success").sum()), len(episodes), len(method.records))
             error = median(series(kept, "position_error"))
             terminated = len(episodes) - len(kept)
