@@ -9,6 +9,7 @@ from synthetic import FakeStore, methods_in, reach_store, study_store
 from wbc_bench.results import analysis
 from wbc_bench.results.figures.reach import write_reach_figures
 from wbc_bench.results.figures.study import error_cdf, outcome_bars, success_by_stratum, write_study_figures
+from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.study import find_study, methods_of
 
@@ -66,4 +67,17 @@ def test_outcome_bars_add_up_to_100():
 def test_a_cdf_ends_at_the_share_that_stood():
     ax = error_cdf(Figure().subplots(), methods(), "position_error")
     for line, (_, method) in zip(ax.get_lines(), methods(), strict=False):
-        assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.stood.mean())
+        assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.not_terminated.mean())
+
+
+def test_a_controller_keeps_its_colour_whoever_else_is_drawn():
+    names = {"a": "One", "a@0": "One", "b": "Two", "c": "Three"}
+    colours = controller_colours(names)
+    assert colours["a"] == colours["a@0"] and len(set(colours.values())) == 3
+    assert colours == controller_colours(dict(reversed(names.items())))
+    labels = {method.spec: label for label, method in methods()}
+    mapping = controller_colours(labels)
+    for chosen in (methods(), methods()[1:], methods()[:2]):
+        ax = error_cdf(Figure().subplots(), chosen, "position_error", mapping)
+        drawn = {line.get_label(): line.get_color() for line in ax.get_lines()}
+        assert all(drawn[label] == mapping[method.spec] for label, method in chosen)

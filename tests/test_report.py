@@ -40,7 +40,7 @@ def test_report_holds_everything_and_loads_nothing(tmp_path):
     path = report.write(collect_all(store.runs()), tmp_path)
     text = path.read_text(encoding="utf-8")
     assert path == tmp_path / "report.html"
-    assert "88.30 ± 2.50" in text and "ik vs hold" in text and "38–163" in text
+    assert "88.30 ± 2.50" in text and "Whole-body IK vs Hold posture" in text and "38–163" in text
     assert text.count("<img ") == 1 and "data:image/svg+xml;base64," in text
     # Nothing is fetched: every source is inside, every link stays on the page.
     assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', text))
@@ -57,7 +57,7 @@ def test_each_table_stands_under_its_own_protocol(tmp_path):
     write_reach_tables(REACH, methods_in(store, "reach_v1"), tmp_path / "tables")
     text = report_of(store, tmp_path)
     ablation, reach = text.index('<h2 id="s0">ablation_v1'), text.index('<h2 id="s1">reach_v1')
-    assert ablation < text.index("ik vs hold") < reach < text.index("38–163")
+    assert ablation < text.index("Whole-body IK vs Hold posture") < reach < text.index("38–163")
 
 
 def test_an_empty_store_says_so(tmp_path):

@@ -8,8 +8,9 @@ from synthetic import FakeRun, FakeStore, frame_of, methods_in, record
 
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.publish import publish
+from wbc_bench.results.analysis import collect
 from wbc_bench.results.store import ResultStore
-from wbc_bench.results.study import Study, StudyError, find_study, released_studies, studies_of
+from wbc_bench.results.study import Study, StudyError, find_study, labels_of, released_studies, studies_of
 from wbc_bench.results.tables.paper import paper_table
 
 MINE = """
@@ -94,3 +95,15 @@ def test_a_study_must_not_take_the_files_of_another_protocol(tmp_path):
     study = find_study(write(tmp_path / "mine.toml", MINE.replace('"mine"', '"nominal_v1"')))
     with pytest.raises(StudyError, match="'nominal_v1' of ablation_v1"):
         publish(copy, tmp_path / "out", studies=[study])
+
+
+def test_a_controller_has_one_name_under_every_protocol():
+    study = find_study("ablation_v1")
+    labels = labels_of(study.rows)
+    assert labels["learned:transformer_gru"] == "Transformer + GRU"  # its last row, not "Reward gating"
+    frame = frame_of(0, np.array(["success"] * 2, dtype=object))
+    run = FakeRun(record("ik", 0, frame, protocol="nominal_v1"), frame)
+    methods = collect([run], labels)
+    table = paper_table(studies_of("nominal_v1")[0], methods)
+    assert table.rows[0][:2] == ("Evaluated", "Whole-body IK")
+    assert "Controllers: Whole-body IK is `ik`." in table.notes

@@ -1,9 +1,12 @@
 """Tables: numbers against hand arithmetic, counts that add up, text that says what is missing."""
 
+import io
+
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
+from rich.console import Console
 from synthetic import FakeRun, FakeStore, frame_of, methods_in, reach_store, record, study_store
 
 from wbc_bench.errors import StoreError, UnknownNameError
@@ -134,7 +137,9 @@ def test_outcomes_add_up():
 
 def test_pairs_are_the_studys_own_and_use_the_same_episodes():
     table = pair_table(ABLATION, methods_in(study_store()))
-    assert list(table.data["A vs B".lower()]) == ["ik vs hold", "ik vs ik:kinematic", "ik vs ik:osqp"]
+    assert list(table.data["A vs B".lower()]) == [
+        f"Whole-body IK vs {name}" for name in ("Hold posture", "IK, kinematic only", "IK on OSQP")
+    ]
     first = table.data.iloc[0]
     assert first["success_diff_pp"] > 0 and first["success_p_holm"] >= first["success_p"]
     frames = [methods_in(study_store())[spec].episodes for spec in ("ik", "hold")]
@@ -165,13 +170,37 @@ def test_markdown_survives_a_round_trip(tmp_path):
 
 
 def test_latex_is_escaped_and_balanced():
-    text = paper_table(ABLATION, methods_in(study_store())).latex()
+    packages, text = paper_table(ABLATION, methods_in(study_store())).latex().split("\n", 1)
+    assert packages == r"% needs \usepackage{booktabs} and \usepackage{graphicx}"
     body = text.replace(r"\%", "").replace(r"\_", "").replace(r"\&", "")
     assert "%" not in body and "±" not in text and "↑" not in text
     assert text.isascii()
     assert text.count(r"\begin{") == text.count(r"\end{") == 2
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert {line.replace(r"\&", "").count("&") for line in rows} == {9}
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 300])
+def test_a_terminal_shows_every_number_and_name(width):
+    methods = methods_in(study_store())
+    for table in (
+        paper_table(ABLATION, methods),
+        outcome_table(ABLATION, methods),
+        pair_table(ABLATION, methods),
+    ):
+        output = io.StringIO()
+        Console(file=output, width=width).print(table.rich())
+        lines = output.getvalue().splitlines()
+        assert max(map(len, lines)) <= width and "…" not in output.getvalue()
+        shown = [[cell.strip() for cell in line.split("│")] for line in lines]
+        cells = {cell for line in shown for cell in line}
+        names = next(k for k, number in enumerate(table.numeric) if number)
+        for row in table.rows:
+            assert set(row[names:]) <= cells  # whole, in one line
+            for name in row[:names]:
+                # a name may go over two lines of its column
+                assert set("".join(name.split())) <= set(output.getvalue())
+                assert name in cells or width < 120
 
 
 def test_same_store_same_bytes(tmp_path):
@@ -230,7 +259,7 @@ def test_oscillation_near_the_ends():
 
 def test_reach_table_has_the_papers_ranges_and_the_grid():
     table = reach_table(REACH, methods_in(reach_store(), "reach_v1"))
-    assert [row[4] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
+    assert [row[5] for row in table.rows] == ["38–163", "3–191", "5–185", "5–185", "5–125", "5–125"]
     assert len(height_table(REACH, methods_in(reach_store(), "reach_v1")["ik"]).rows) == 41
 
 
@@ -239,7 +268,7 @@ def test_the_rule_that_is_printed_and_applied_is_that_of_the_records():
     frame = heights([1, 3, 1, 1])
     methods = methods_in(FakeStore([FakeRun(record("ik", 0, frame, rule=rule), frame)]))
     reach = reach_table(REACH, methods)
-    assert reach.rows[-1][4] == "10–15"  # 3 cm is not within 2 cm
+    assert reach.rows[-1][5] == "10–15"  # 3 cm is not within 2 cm
     for table in (reach, paper_table(ABLATION, methods), height_table(REACH, methods["ik"])):
         text = " ".join(table.notes)
         assert "final 0.5 s" in text and "1 s" not in text.replace("0.5 s", "") and "5 cm" not in text

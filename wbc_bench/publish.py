@@ -16,11 +16,12 @@ from wbc_bench.results.analysis import Evaluated, collect_all
 from wbc_bench.results.doors import DoorRun, door_table, read_doors
 from wbc_bench.results.figures.reach import write_reach_figures
 from wbc_bench.results.figures.study import write_study_figures
+from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
 from wbc_bench.results.store import ResultStore
-from wbc_bench.results.study import Study, StudyError, released_studies, studies_of
+from wbc_bench.results.study import Study, StudyError, labels_of, released_studies, studies_of
 from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 
@@ -43,8 +44,9 @@ def publish(
         StudyError: A study has the name of a protocol that is not its own.
         UnknownNameError: A controller named has no run under any protocol.
     """
-    evaluated = collect_all(store.runs())
     known_studies = list({study.name: study for study in (*released_studies(), *studies)}.values())
+    labels = labels_of(row for study in known_studies for row in study.rows)
+    evaluated = collect_all(store.runs(), labels)
     for study in known_studies:
         if study.name != study.protocol and study.name in evaluated:
             raise StudyError(
@@ -57,14 +59,16 @@ def publish(
     for spec in beside:
         if spec not in known:
             raise UnknownNameError("evaluated controller", spec, known, "--workspace")
+    specs = known | {track.record.controller for track in tracks}
+    colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)})
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
             made = Path(folder)
             for protocol, methods in evaluated.items():
-                _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies))
-            _write_tracks(tracks, made)
-            _write_doors(doors, made)
+                _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
+            _write_tracks(tracks, made, labels, colours)
+            _write_doors(doors, made, labels)
             report.write(evaluated, made, out, {study.name: study.protocol for study in known_studies})
             return [
                 _move(path, out / path.relative_to(made))
@@ -79,7 +83,7 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a track cannot be read or the folder cannot be written.
     """
     with _writing(out):
-        return _write_tracks(read_tracks(root), out)
+        return _write_tracks(read_tracks(root), out, _released_labels())
 
 
 def publish_doors(root: Path, out: Path) -> list[Path]:
@@ -88,7 +92,7 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a run cannot be read or the folder cannot be written.
     """
     with _writing(out):
-        return _write_doors(read_doors(root), out)
+        return _write_doors(read_doors(root), out, _released_labels())
 
 
 @contextmanager
@@ -106,7 +110,12 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
 
 
 def _write_protocol(
-    name: str, methods: Mapping[str, Evaluated], out: Path, beside: Sequence[str], studies: Sequence[Study]
+    name: str,
+    methods: Mapping[str, Evaluated],
+    out: Path,
+    beside: Sequence[str],
+    studies: Sequence[Study],
+    colours: Mapping[str, str],
 ) -> None:
     released = read_protocol(PROTOCOLS / f"{name}.toml") if name in protocol_names() else None
     for study in studies:
@@ -115,22 +124,28 @@ def _write_protocol(
             write_reach_figures(study, methods, out / "figures")
         else:
             write_study_tables(study, methods, out / "tables")
-            write_study_figures(study, methods, out / "figures")
+            write_study_figures(study, methods, out / "figures", colours)
             write_workspace(study, methods, out / "figures", [spec for spec in beside if spec in methods])
     if released:
         manifest, _ = read_manifest(released, manifest_path(PROTOCOLS / f"{name}.toml"))
         write_targets(target_frame(manifest), name, out / "figures")
 
 
-def _write_tracks(tracks: list[Track], out: Path) -> list[Path]:
+def _released_labels() -> dict[str, str]:
+    return labels_of(row for study in released_studies() for row in study.rows)
+
+
+def _write_tracks(
+    tracks: list[Track], out: Path, labels: Mapping[str, str], colours: Mapping[str, str] | None = None
+) -> list[Path]:
     if not tracks:
         return []
-    paths = tracking_table(tracks).write(out / "tables")
-    return paths + write_tracking(tracks, out / "figures")
+    paths = tracking_table(tracks, labels).write(out / "tables")
+    return paths + write_tracking(tracks, out / "figures", labels, colours)
 
 
-def _write_doors(runs: list[DoorRun], out: Path) -> list[Path]:
-    return door_table(runs).write(out / "tables") if runs else []
+def _write_doors(runs: list[DoorRun], out: Path, labels: Mapping[str, str]) -> list[Path]:
+    return door_table(runs, labels).write(out / "tables") if runs else []
 
 
 def _move(source: Path, destination: Path) -> Path:

@@ -34,6 +34,12 @@ class Evaluated:
     spec: str
     records: tuple[Any, ...]
     episodes: pd.DataFrame  # the episode record, replicates concatenated
+    label: str = ""  # what the studies call it
+
+    @property
+    def name(self) -> str:
+        """Its label, or its spec where no study lists it."""
+        return self.label or self.spec
 
     def first(self, episodes: int) -> "Evaluated":
         """The same, with the first episodes of each replicate alone."""
@@ -67,12 +73,14 @@ class Evaluated:
         return any(record.checkpoint_sha256 for record in self.records)
 
     @property
-    def stood(self) -> Mask:
-        return stood(self.episodes)
+    def not_terminated(self) -> Mask:
+        return not_terminated(self.episodes)
 
 
-def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
+def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) -> dict[str, Evaluated]:
     """Spec -> its runs, sorted by spec, of runs under one protocol; reads their episodes, so call it once.
+
+    `labels` maps a spec to its name in tables and figures.
 
     Raises: StoreError when two runs under one name were evaluated with different protocols or manifests.
     """
@@ -100,6 +108,7 @@ def collect(runs: Iterable[RunLike]) -> dict[str, Evaluated]:
             spec,
             tuple(run.record for run in group),
             pd.concat([run.episodes() for run in group], ignore_index=True),
+            (labels or {}).get(spec, ""),
         )
         for spec, group in grouped.items()
     }
@@ -122,7 +131,9 @@ def _refuse_two_versions(records: Sequence[Any]) -> None:
                 )
 
 
-def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
+def collect_all(
+    runs: Iterable[RunLike], labels: Mapping[str, str] | None = None
+) -> dict[str, dict[str, Evaluated]]:
     """Protocol -> spec -> its runs, both sorted; every file of episodes is read once.
 
     Raises: StoreError, see `collect`.
@@ -130,7 +141,7 @@ def collect_all(runs: Iterable[RunLike]) -> dict[str, dict[str, Evaluated]]:
     grouped: dict[str, list[RunLike]] = {}
     for run in sorted(runs, key=lambda run: run.record.protocol):
         grouped.setdefault(run.record.protocol, []).append(run)
-    return {protocol: collect(group) for protocol, group in grouped.items()}
+    return {protocol: collect(group, labels) for protocol, group in grouped.items()}
 
 
 def rule_of(evaluated: Mapping[str, Evaluated]) -> SuccessRule:
@@ -148,7 +159,7 @@ def subset(episodes: pd.DataFrame, mask: Mask) -> pd.DataFrame:
     return episodes.take(np.flatnonzero(mask))
 
 
-def stood(episodes: pd.DataFrame) -> Mask:
+def not_terminated(episodes: pd.DataFrame) -> Mask:
     """Which episodes did not terminate, (N,)."""
     return ~np.isin(np.asarray(episodes["outcome"], dtype=str), [str(outcome) for outcome in TERMINATED])
 
@@ -174,10 +185,12 @@ class HeightRange(NamedTuple):
 def reached(episodes: pd.DataFrame, rule: SuccessRule) -> bool:
     """Whether the median error over the episodes of one height is below the tolerance of success.
 
-    A terminated episode, or one without a value, counts as infinitely far; so more than half must have stood.
+    A terminated episode, or one without a value, counts as infinitely far: fewer than half may.
     """
     error = column(episodes, "position_error")
-    return bool(np.median(np.where(stood(episodes) & ~np.isnan(error), error, np.inf)) < rule.position)
+    return bool(
+        np.median(np.where(not_terminated(episodes) & ~np.isnan(error), error, np.inf)) < rule.position
+    )
 
 
 def by_height(episodes: pd.DataFrame) -> list[tuple[float, pd.DataFrame]]:
@@ -210,11 +223,11 @@ def reach_range(episodes: pd.DataFrame, rule: SuccessRule, strict: bool = False)
 
 
 def oscillation(episodes: pd.DataFrame, span: HeightRange, metric: str) -> tuple[float, float, float]:
-    """Median of a metric over episodes that stood: near the low end of a range, between, near the high end.
+    """Median of a metric near the low end of a range, between, and near the high end.
 
-    Near is within END_ZONE on either side, so also just outside of the range.
+    Terminated episodes are left out. Near is within END_ZONE on either side, so also just outside the range.
     """
-    kept = subset(episodes, stood(episodes))
+    kept = subset(episodes, not_terminated(episodes))
     height, values = column(kept, "height"), column(kept, metric)
     zone = END_ZONE + 1e-6  # the grid went through floating point
     low, high = np.abs(height - span.low) <= zone, np.abs(height - span.high) <= zone

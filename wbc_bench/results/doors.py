@@ -1,8 +1,9 @@
-"""What pushing doors shut leaves behind: a row an episode, a record of the run, and the table of them.
+"""What pushing doors shut leaves behind: a row per episode, a record of the run, and the table of them.
 
 <root>/doors/<source>/<controller>/<condition>_<seed>/run.json, episodes.parquet
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import pandas as pd
 import pyarrow as pa
 
 from wbc_bench.results import stats
-from wbc_bench.results.formatting import DEG, number_text
+from wbc_bench.results.formatting import DEG, names_note, number_text
 from wbc_bench.results.records import driven_folder, parquet_of, read_record, write_record
 from wbc_bench.results.table import Table
 from wbc_bench.results.tracking import STOOD
@@ -86,8 +87,9 @@ def _read(path: Path) -> DoorRun:
     return DoorRun(record, episodes.to_pandas())
 
 
-def door_table(runs: list[DoorRun]) -> Table:
-    """A row a run."""
+def door_table(runs: list[DoorRun], labels: Mapping[str, str] | None = None) -> Table:
+    """A row per run; `labels` maps a spec to its name."""
+    labels = labels or {}
     rows, data = [], []
     for record, episodes in runs:
         rate = stats.wilson(record.successes, record.completed)
@@ -99,7 +101,7 @@ def door_table(runs: list[DoorRun]) -> Table:
         rows.append(
             (
                 f"{record.source} `{digest[:12]}`" if digest else record.source,
-                f"`{record.controller}`",
+                labels.get(record.controller, f"`{record.controller}`"),
                 record.condition,
                 str(record.seed),
                 f"{record.successes}/{record.completed}",
@@ -129,4 +131,6 @@ def door_table(runs: list[DoorRun]) -> Table:
         f"A door counts as closed below {angle * DEG:.1f} degrees; an episode lasts {duration:g} s."
         for angle, duration in sorted({(run.record.closed_below, run.record.duration) for run in runs})
     ]
+    driven = dict.fromkeys(run.record.controller for run in runs)
+    notes += names_note({spec: labels[spec] for spec in driven if spec in labels})
     return Table("doors", "Doors pushed shut", header, tuple(rows), tuple(notes), pd.DataFrame(data))

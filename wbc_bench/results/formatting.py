@@ -1,5 +1,7 @@
 """How numbers stand in a cell: units, digits, minus signs, intervals; an undefined value is a dash."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from wbc_bench.outcomes import SuccessRule
@@ -33,6 +35,12 @@ def tolerance_text(rule: SuccessRule) -> str:
 
 def window_text(rule: SuccessRule) -> str:
     return f"final {rule.window:g} s"
+
+
+def names_note(names: Mapping[str, str]) -> tuple[str, ...]:
+    """Which controllers stand behind their names (spec -> name); nothing where all go by their spec."""
+    parts = [f"{name} is `{spec}`" for spec, name in names.items() if name != spec]
+    return (f"Controllers: {', '.join(parts)}.",) if parts else ()
 
 
 def number_text(value: float, digits: int) -> str:

@@ -94,7 +94,7 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
         "".join(f'<th class="number">{name}</th>' for name in (*numbers, "Ended at (s)")) + "<th>Replay</th>"
     )
     return (
-        f"<details><summary>Worst episodes of <code>{html.escape(method.spec)}</code></summary>\n"
+        f"<details><summary>Worst episodes of {html.escape(method.name)}</summary>\n"
         f'<div class="table gallery"><table><thead><tr>{head}</tr></thead>\n<tbody>'
         + "\n".join(rows)
         + "</tbody></table></div></details>\n"

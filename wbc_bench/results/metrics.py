@@ -1,4 +1,4 @@
-"""METRICS: one number an episode, each with its unit, its direction and the place its formula comes from.
+"""METRICS: one number per episode, each with its unit, its direction and the place its formula comes from.
 
 Pure NumPy. A value that is undefined (an episode of no steps, a window too short) is NaN, never 0.
 """

@@ -1,4 +1,4 @@
-"""A run that is kept as two files: its data as parquet, and a JSON record of what was run."""
+"""A run as two files: its data as parquet, and a JSON record of what was run."""
 
 import hashlib
 from pathlib import Path

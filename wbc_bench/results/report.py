@@ -29,14 +29,20 @@ p.lead, p.rule, nav { color: #555; }
 p.rule { font-size: 12.5px; max-width: 960px; margin: 24px 0 0; }
 a { color: #0072b2; text-decoration: none; }
 nav a { margin-right: 16px; }
-.table { overflow-x: auto; }
+/* shadows tell that a table goes on: many browsers hide a scroll bar that is not in use */
+.table { overflow-x: auto; scrollbar-width: thin;
+  background: linear-gradient(90deg, #fff 30%, #fff0) 0 0 / 40px 100% no-repeat local,
+    linear-gradient(270deg, #fff 30%, #fff0) 100% 0 / 40px 100% no-repeat local,
+    linear-gradient(90deg, #0003, #0000) 0 0 / 12px 100% no-repeat scroll,
+    linear-gradient(270deg, #0003, #0000) 100% 0 / 12px 100% no-repeat scroll; }
 table { border-collapse: collapse; font-size: 12px; border-top: 1.5px solid #1c1c1c;
   border-bottom: 1.5px solid #1c1c1c; font-variant-numeric: tabular-nums; }
 th { text-align: left; max-width: 130px; vertical-align: bottom;
   border-bottom: 1px solid #1c1c1c; font-weight: 600; }
 th, td { padding: 3px 7px; }
 td { white-space: nowrap; }
-td:first-child { font-weight: 600; }
+td:first-child { font-weight: 600; white-space: normal; }
+.provenance td { white-space: normal; }
 .number { text-align: right; }
 tr.group td { border-top: 1px solid #c9c9c9; }
 tbody tr:hover { background: #f3f7fa; }
@@ -70,7 +76,7 @@ CAPTIONS = {  # end of a figure's name -> what it shows; {window} is that of the
     "tracking": "Error of the hand over time while its target moves.",
 }
 REACH_CAPTION = (
-    "Straight ahead over height: the range reached, success, and in the {window} the position error and "
+    "Straight ahead over height: success, the range reached, and in the {window} the position error and "
     "how the hand oscillates, as speed and as smoothness (spectral arc length, 0 is smoothest)."
 )
 
@@ -108,7 +114,7 @@ class _Sidecar(msgspec.Struct):
 
 
 def provenance_html(records: list[Any]) -> str:
-    """One row a run, and under it the machines and versions that occur, each once."""
+    """One row per run, and under it the machines and versions that occur, each once."""
     header = ("Protocol", "Controller", "Replicate", "Completed", "Protocol digest", "Manifest sha256")
     header += ("Checkpoint", "Commit", "Created (UTC)", "Wall time (s)", "Workers", "Setup")
     setups: dict[tuple[str, str], str] = {}
@@ -124,13 +130,13 @@ def provenance_html(records: list[Any]) -> str:
             *(
                 _digest(record.checkpoint_sha256),
                 _digest(record.git_commit) + dirty,
-                html.escape(record.created),
+                html.escape(record.created.removesuffix("+00:00").replace("T", " ")),  # breaks at the space
             ),
             *(f"{record.wall_time_s:.1f}", str(record.workers), setup),
         )
         rows.append("<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     head = "".join(f"<th>{name}</th>" for name in header)
-    table = f'<div class="table"><table><thead><tr>{head}</tr></thead>\n<tbody>' + "\n".join(rows)
+    table = f'<div class="table provenance"><table><thead><tr>{head}</tr></thead>\n<tbody>' + "\n".join(rows)
     details = "".join(
         f"<li><b>Setup {name}</b>: {machine}<br>{versions}</li>\n"
         for (machine, versions), name in setups.items()

@@ -120,13 +120,23 @@ def study_rows(study: Study, evaluated: Mapping[str, Evaluated]) -> list[Row]:
     """The study's rows, then whatever else was evaluated: a user's own controller needs no list."""
     named = {row.spec for row in study.rows}
     heading = "Other" if study.rows else "Evaluated"
-    return [*study.rows, *(Row(heading, spec, spec) for spec in evaluated if spec not in named)]
+    others = (method for spec, method in evaluated.items() if spec not in named)
+    return [*study.rows, *(Row(heading, method.name, method.spec) for method in others)]
 
 
 def methods_of(study: Study, evaluated: Mapping[str, Evaluated]) -> list[tuple[str, Evaluated]]:
-    """Evaluated controllers with their labels, once each (one may stand under two headings)."""
-    rows = {row.spec: row.label for row in reversed(study_rows(study, evaluated))}
-    return [(label, evaluated[spec]) for spec, label in reversed(rows.items()) if spec in evaluated]
+    """Evaluated controllers with their labels, once each, in the order of their last rows."""
+    labels = labels_of(study_rows(study, evaluated))
+    return [(label, evaluated[spec]) for spec, label in labels.items() if spec in evaluated]
+
+
+def labels_of(rows: Iterable[Row]) -> dict[str, str]:
+    """Spec -> label. A controller under several headings is called what its last row says."""
+    labels: dict[str, str] = {}
+    for row in rows:
+        labels.pop(row.spec, None)  # to the end
+        labels[row.spec] = row.label
+    return labels
 
 
 def _mistakes(study: Study) -> Iterable[tuple[str, str]]:

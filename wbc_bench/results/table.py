@@ -2,12 +2,15 @@
 
 import html
 import re
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from rich.table import Table as RichTable
+from rich.text import Text
 
 LONG = 30  # rows beyond which a page shows a table on demand only
 
@@ -43,25 +46,35 @@ class Table:
             if k and row[0]:
                 body.append(r"\midrule")
             body.append(" & ".join(map(_latex, row)) + r" \\")
+        # \resizebox would also stretch a narrow table: its width is the natural one where that fits.
+        fit = r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{"
         return "\n".join(
             [
+                r"% needs \usepackage{booktabs} and \usepackage{graphicx}",
                 r"\begin{table*}[t]",
                 r"\centering",
                 rf"\caption{{{_latex(self.title)}}}",
                 rf"\label{{tab:{self.name}}}",
-                r"\footnotesize",
-                rf"\begin{{tabular}}{{{''.join('r' if number else 'l' for number in self.numeric)}}}",
+                r"\footnotesize\setlength{\tabcolsep}{3pt}",
+                rf"{fit}\begin{{tabular}}{{{''.join('r' if number else 'l' for number in self.numeric)}}}",
                 r"\toprule",
-                " & ".join(rf"\textbf{{{_latex(cell)}}}" for cell in self.header) + r" \\",
+                " & ".join(map(self._latex_header, range(len(self.header)))) + r" \\",
                 r"\midrule",
                 *body,
                 r"\bottomrule",
-                r"\end{tabular}",
+                r"\end{tabular}}",
                 *(rf"\par\smallskip\raggedright {_latex(note)}" for note in self.notes),
                 r"\end{table*}",
                 "",
             ]
         )
+
+    def _latex_header(self, k: int) -> str:
+        """The header of a column, over as many lines as keep it about as narrow as the cells."""
+        width = max([8, *(len(row[k]) for row in self.rows)])  # characters; no column is narrower
+        lines = textwrap.wrap(self.header[k], width, break_long_words=False) or [""]
+        stacked = r" \\ ".join(rf"\textbf{{{_latex(line)}}}" for line in lines)
+        return rf"\shortstack[{'r' if self.numeric[k] else 'l'}]{{{stacked}}}"
 
     def csv(self) -> str:
         # Six digits: the last bits of a mean depend on the vector width of the processor.
@@ -86,15 +99,8 @@ class Table:
         return f"<details{'' if long else ' open'}><summary>{title}</summary>\n{table}</details>\n"
 
     def rich(self) -> Any:
-        """For the terminal."""
-        from rich.table import Table as RichTable
-
-        table = RichTable(title=self.title, caption="\n".join(self.notes), caption_justify="left")
-        for name in self.header:
-            table.add_column(name)
-        for k, row in enumerate(self.rows):
-            table.add_row(*row, end_section=k + 1 < len(self.rows) and bool(self.rows[k + 1][0]))
-        return table
+        """For the terminal: split into grids below each other where it is wider than the console."""
+        return _Terminal(self)
 
     def write(self, out_dir: Path) -> list[Path]:
         """Writes <out_dir>/<name>.md, .tex and .csv."""
@@ -105,6 +111,67 @@ class Table:
             path.write_text(text, encoding="utf-8", newline="\n")
             paths.append(path)
         return paths
+
+
+class _Terminal:
+    """Draws a table in the width of the console; neither a number nor a name loses a character."""
+
+    def __init__(self, table: Table) -> None:
+        self._table = table
+        # The first columns name a row, up to the first number; they are repeated in every grid.
+        self._names = max(1, next((k for k, number in enumerate(table.numeric) if number), 0))
+        cells = [[row[k] for row in table.rows] for k in range(len(table.header))]
+        self._widths = [
+            max([*map(len, column), *map(len, name.split())])  # a header wraps between words
+            for name, column in zip(table.header, cells, strict=True)
+        ]
+
+    def __rich_console__(self, console: Any, options: Any) -> Iterator[Any]:
+        names, grids = self._layout(options.max_width)
+        yield Text(self._table.title, style="italic")
+        for columns in grids:
+            yield self._grid(names, columns)
+        for note in self._table.notes:
+            yield Text(note, style="dim")
+
+    def _layout(self, width: int) -> tuple[list[int], list[list[int]]]:
+        """Widths of the columns that name a row, and which other columns each grid holds."""
+        frame = 3  # characters of padding and border per column, and one more border on the left
+        rest = list(range(self._names, len(self._widths)))
+        names = self._widths[: self._names]
+        if sum(self._widths) + frame * len(self._widths) + 1 <= width:
+            return names, [rest]
+        # Half of the console at least is for numbers, or every grid would hold a column or two.
+        widest = max([width // 2, *(self._widths[k] + frame for k in rest)])
+        while sum(names) + frame * len(names) + widest + 1 > width and max(names) > 1:
+            names[names.index(max(names))] -= 1  # the longest names go over two lines
+        room = width - 1 - sum(names) - frame * len(names)
+        grids: list[list[int]] = [[]]
+        left = room
+        for k in rest:
+            if grids[-1] and self._widths[k] + frame > left:
+                grids.append([])
+                left = room
+            grids[-1].append(k)
+            left -= self._widths[k] + frame
+        return names, grids
+
+    def _grid(self, names: Sequence[int], columns: Sequence[int]) -> Any:
+        rows, numeric = self._table.rows, self._table.numeric
+        grid = RichTable()
+        for k, width in enumerate(names):
+            grid.add_column(Text(self._table.header[k]), width=width, overflow="fold")
+        for k in columns:
+            grid.add_column(
+                Text(self._table.header[k]),
+                width=self._widths[k],
+                justify="right" if numeric[k] else "left",
+                overflow="fold",
+            )
+        for k, row in enumerate(rows):
+            cells = [Text(row[c]) for c in (*range(self._names), *columns)]  # "[...]" is no markup
+            grid.add_row(*cells, end_section=k + 1 < len(rows) and bool(rows[k + 1][0]))
+        return grid
 
 
 def read_markdown(path: Path) -> Table:

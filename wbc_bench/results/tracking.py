@@ -3,6 +3,7 @@
 <root>/tracks/<source>/<controller>/<condition>_<seed>/track.json, series.parquet
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,7 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from wbc_bench.results.formatting import CM, DEG, NONE, number_text
+from wbc_bench.results.formatting import CM, DEG, NONE, names_note, number_text
 from wbc_bench.results.metrics import spectral_arc_length
 from wbc_bench.results.records import driven_folder, parquet_of, read_record, write_record
 from wbc_bench.results.table import Table
@@ -43,7 +44,7 @@ class Tracked:
 
 
 class Series:
-    """Collects a run, a control step at a time."""
+    """Collects a run step by step."""
 
     def __init__(self, control_period: float) -> None:
         self._period = control_period  # [s]
@@ -72,7 +73,7 @@ class Series:
 
 
 class Scores(NamedTuple):
-    """One number a run; errors over the steps completed, the rest NaN unless the robot stood to the end."""
+    """One number per run; errors over the steps completed, the rest NaN unless the robot stood to the end."""
 
     position_mean: float  # [m]
     position_p95: float  # [m]
@@ -242,8 +243,12 @@ COLUMNS = (  # header, score, scale, digits
 )
 
 
-def tracking_table(tracks: list[Track]) -> Table:
-    """Controllers x sources; a row is the mean over the seeds of one condition."""
+def tracking_table(tracks: list[Track], labels: Mapping[str, str] | None = None) -> Table:
+    """Controllers x sources; a row is the mean over the seeds of one condition.
+
+    `labels` maps a spec to its name.
+    """
+    labels = labels or {}
     groups: dict[tuple[str, str, str], list[Track]] = {}
     for track in tracks:
         groups.setdefault(_key(track.record)[:3], []).append(track)
@@ -256,7 +261,15 @@ def tracking_table(tracks: list[Track]) -> Table:
         )
         cells = (number_text(values[name] * scale, digits) for _, name, scale, digits in COLUMNS)
         counts = f"{stood}/{len(runs)}", f"{completed:.1f}/{requested:.1f}"
-        rows.append((source if source != before else "", f"`{controller}`", condition, *counts, *cells))
+        rows.append(
+            (
+                source if source != before else "",
+                labels.get(controller, f"`{controller}`"),
+                condition,
+                *counts,
+                *cells,
+            )
+        )
         before = source
         data.append(
             {"source": source, "controller": controller, "condition": condition, "runs": len(runs)}
@@ -273,6 +286,7 @@ def tracking_table(tracks: list[Track]) -> Table:
         f"than {FOLLOWS:.0%} of the target's variance.",
         "SPARC: spectral arc length of the speed over the whole run; 0 is smoothest, and it falls with the "
         "length of a run, so compare a hand with its target. Lag and SPARC are undefined after a fall.",
+        *names_note({c: labels[c] for _, c, _ in groups if c in labels}),
     )
     return Table("tracking", "Tracking of moving targets", header, tuple(rows), notes, pd.DataFrame(data))
 

@@ -16,8 +16,8 @@ from wbc_bench.results.analysis import (
     Evaluated,
     by_height,
     column,
+    not_terminated,
     reach_range,
-    stood,
     strata_of,
     variants,
 )
@@ -44,13 +44,13 @@ def reach_success(ax: Axes, episodes: pd.DataFrame, label: str, colour: str) -> 
 def reach_metric(
     ax: Axes, episodes: pd.DataFrame, metric: str, label: str, colour: str, worst: float, scale: float
 ) -> Axes:
-    """Median of a metric times `scale` at each height [cm], of episodes that stood, and a band to a quantile.
+    """Median of a metric times `scale` at each height [cm], of episodes that did not terminate, and a band.
 
     The band covers what nine in ten of the episodes on the bad side of the median stay within.
     """
     rows = []
     for height, group in by_height(episodes):
-        values = column(group, metric)[stood(group)] * scale
+        values = column(group, metric)[not_terminated(group)] * scale
         values = values[~np.isnan(values)]
         middle, tail = np.quantile(values, [0.5, worst]) if len(values) else np.full(2, np.nan)
         rows.append((height * CM, middle, tail))
@@ -96,7 +96,7 @@ def _shade_beyond(ax: Axes, episodes: pd.DataFrame) -> None:
 
 
 def reach_figure(study: Study, method: Evaluated) -> Figure:
-    """A column a gripper orientation: range, success, error, sway over height; a colour a condition."""
+    """Range, success, error and sway by height; a column per gripper orientation, a colour per condition."""
     parts = variants(method.episodes)
     orientations = sorted({orientation for _, orientation, _ in parts})
     figure = Figure(figsize=(1.6 + 3.6 * len(orientations), 9.2))
@@ -140,7 +140,7 @@ def reach_figure(study: Study, method: Evaluated) -> Figure:
         handles, labels = [*handles, Patch(color=SHADE)], [*labels, "no feasible pose at this height"]
     figure.legend(handles, labels, loc="outside lower center", ncols=4)
     figure.suptitle(
-        f"{method.spec}: vertical reach ({method.counts} episodes)", x=0.01, ha="left", weight="bold"
+        f"{method.name}: vertical reach ({method.counts} episodes)", x=0.01, ha="left", weight="bold"
     )
     return figure
 

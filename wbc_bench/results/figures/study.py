@@ -24,9 +24,9 @@ from wbc_bench.results.analysis import (
 from wbc_bench.results.figures.style import (
     DASHES,
     GREY,
-    METHOD_COLOURS,
     OUTCOME_COLOURS,
     STRATUM_COLOURS,
+    controller_colours,
     save,
     styled,
 )
@@ -76,8 +76,14 @@ def outcome_bars(ax: Axes, methods: Sequence[tuple[str, Evaluated]]) -> Axes:
     return _method_axis(ax, methods)
 
 
-def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -> Axes:
-    """Share of all episodes [%] that stood with an error up to x; what is missing to 100 % terminated."""
+def error_cdf(
+    ax: Axes,
+    methods: Sequence[tuple[str, Evaluated]],
+    metric: str,
+    colours: Mapping[str, str] | None = None,
+) -> Axes:
+    """Share of all episodes [%] with an error up to x; what is missing to 100 % terminated."""
+    colours = colours or controller_colours({method.spec: label for label, method in methods})
     rule = rule_of({method.spec: method for _, method in methods})
     scale, unit, tolerance = {
         "position_error": (CM, "cm", rule.position * CM),
@@ -85,7 +91,7 @@ def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -
     }[metric]
     ticks, (left, right) = (0.5, 1, 2, 5, 10, 20, 50, 100), (0.3, 200.0)
     for k, (label, method) in enumerate(methods):
-        error = column(method.episodes, metric)[method.stood] * scale
+        error = column(method.episodes, metric)[method.not_terminated] * scale
         error = np.sort(error[~np.isnan(error)])
         share = 100.0 * np.arange(1, len(error) + 1) / method.completed
         # A thousand points draw the same curve as three thousand, in a third of the bytes.
@@ -95,7 +101,7 @@ def error_cdf(ax: Axes, methods: Sequence[tuple[str, Evaluated]], metric: str) -
             np.concatenate([[0.0], share[kept], share[-1:]]) if len(error) else [],
             where="post",
             label=label,
-            color=METHOD_COLOURS[k % len(METHOD_COLOURS)],
+            color=colours[method.spec],
             linestyle=DASHES[k % len(DASHES)],
             zorder=2.0 + 0.1 * (k % len(DASHES)),  # dashes above solid lines
         )
@@ -119,8 +125,16 @@ def _method_axis(ax: Axes, methods: Sequence[tuple[str, Evaluated]]) -> Axes:
     return ax
 
 
-def write_study_figures(study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
-    """Success by stratum, outcomes and error distributions of a study, straight into `out_dir`."""
+def write_study_figures(
+    study: Study,
+    evaluated: Mapping[str, Evaluated],
+    out_dir: Path | str,
+    colours: Mapping[str, str] | None = None,
+) -> list[Path]:
+    """Success by stratum, outcomes and error distributions of a study, straight into `out_dir`.
+
+    `colours` maps a spec to its colour in all figures of a report (`controller_colours`).
+    """
     methods = methods_of(study, evaluated)
     if not methods:
         return []
@@ -138,8 +152,8 @@ def write_study_figures(study: Study, evaluated: Mapping[str, Evaluated], out_di
 
         figure = Figure(figsize=(7.6, 3.5))
         left, right = figure.subplots(1, 2, sharey=True)
-        error_cdf(left, methods, "position_error").set_title("Position")
-        error_cdf(right, methods, "orientation_error").set(title="Orientation", ylabel="")
+        error_cdf(left, methods, "position_error", colours).set_title("Position")
+        error_cdf(right, methods, "orientation_error", colours).set(title="Orientation", ylabel="")
         figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=4)
         paths += save(figure, f"{study.name}_errors", out_dir)
     return paths

@@ -1,5 +1,6 @@
 """Colours and line styles of all figures, and how a figure is saved: equal figures give equal bytes."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,16 @@ CONDITION_LINES: dict[str, dict[str, Any]] = {
     "randomised": {"lw": 0.6, "alpha": 0.45, "zorder": 2},
 }
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # so that curves that coincide both show
+
+
+def controller_colours(names: Mapping[str, str]) -> dict[str, str]:
+    """Spec -> colour; controllers of one name share it, so that all figures of a report agree.
+
+    Args:
+        names: Spec -> name in the figures, of every controller of the report.
+    """
+    order = {name: k for k, name in enumerate(sorted(set(names.values())))}
+    return {spec: METHOD_COLOURS[order[name] % len(METHOD_COLOURS)] for spec, name in names.items()}
 
 
 def save(figure: Figure, name: str, out_dir: Path | str) -> list[Path]:

@@ -1,6 +1,6 @@
 """The error of the hand over time while its target moves."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from wbc_bench.results.figures.style import CONDITION_LINES, GREY, METHOD_COLOURS, save, styled
+from wbc_bench.results.figures.style import CONDITION_LINES, GREY, controller_colours, save, styled
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.results.tracking import STOOD, Track
 
 
-def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: dict[str, str]) -> Axes:
+def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: Mapping[str, str]) -> Axes:
     """Error over time of every run of one source, `name` as in `Tracked`; a cross at the top where one fell.
 
     The axis is that of the runs that stood: the error of a robot on its way to the ground says nothing.
@@ -33,11 +33,20 @@ def tracking_error(ax: Axes, tracks: Sequence[Track], name: str, colours: dict[s
     return ax
 
 
-def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
-    """Error over time as `tracking`: a row a source, position left, orientation right."""
+def write_tracking(
+    tracks: Sequence[Track],
+    out_dir: Path | str,
+    labels: Mapping[str, str] | None = None,
+    colours: Mapping[str, str] | None = None,
+) -> list[Path]:
+    """Error over time as `tracking`: a row per source, position left, orientation right.
+
+    `labels` and `colours` map a spec to its name and its colour in all figures of a report.
+    """
     sources = list(dict.fromkeys(track.record.source for track in tracks))
     controllers = sorted({track.record.controller for track in tracks})
-    colours = dict(zip(controllers, METHOD_COLOURS * len(controllers), strict=False))
+    names = {spec: (labels or {}).get(spec, spec) for spec in controllers}
+    colours = colours or controller_colours(names)
     conditions = sorted({track.record.condition for track in tracks})
     with styled():
         figure = Figure(figsize=(8.0, 0.9 + 1.45 * len(sources)))
@@ -51,7 +60,7 @@ def write_tracking(tracks: Sequence[Track], out_dir: Path | str) -> list[Path]:
         for ax in axes[-1]:
             ax.set_xlabel("Time (s)")
         figure.align_ylabels()
-        handles = [Line2D([], [], color=colours[name], label=name) for name in controllers]
+        handles = [Line2D([], [], color=colours[spec], label=name) for spec, name in names.items()]
         if len(conditions) > 1:
             handles += [
                 Line2D([], [], color=GREY, label=name, **CONDITION_LINES[name]) for name in conditions

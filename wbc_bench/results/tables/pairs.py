@@ -32,8 +32,8 @@ def _compare_rows(pairs: Sequence[tuple[str, Evaluated, Evaluated, str | None]])
     results, tests = [], []
     for name, a, b, stratum in pairs:
         both = pd.merge(
-            a.episodes.assign(stood=a.stood),
-            b.episodes.assign(stood=b.stood),
+            a.episodes.assign(not_terminated=a.not_terminated),
+            b.episodes.assign(not_terminated=b.not_terminated),
             on=["replicate", "episode"],
             suffixes=("_a", "_b"),
             validate="one_to_one",
@@ -41,7 +41,7 @@ def _compare_rows(pairs: Sequence[tuple[str, Evaluated, Evaluated, str | None]])
         if stratum is not None:
             both = subset(both, np.asarray(both["stratum_a"] == stratum))
         seeds = len(np.unique(series(both, "replicate")))
-        neither = subset(both, np.asarray(both["stood_a"] & both["stood_b"], dtype=bool))
+        neither = subset(both, np.asarray(both["not_terminated_a"] & both["not_terminated_b"], dtype=bool))
         result: dict[str, Any] = {"name": name, "a": a.spec, "b": b.spec}
         result |= {"episodes": len(both), "both_stood": len(neither)}
         p_values = dict.fromkeys(("success", "position_error", "orientation_error"), float("nan"))
@@ -110,10 +110,11 @@ def _compare_table(name: str, title: str, first: str, results: list[dict[str, An
 
 def pair_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
     """The study's pairs of methods on the episodes both of them met."""
-    specs = [method.spec for _, method in methods_of(study, evaluated)]
+    labels = {method.spec: label for label, method in methods_of(study, evaluated)}
+    specs = list(labels)
     pairs = study.pairs or [(a, b) for k, a in enumerate(specs) for b in specs[k + 1 :]]
     known = [
-        (f"{a} vs {b}", evaluated[a], evaluated[b], None)
+        (f"{labels[a]} vs {labels[b]}", evaluated[a], evaluated[b], None)
         for a, b in pairs
         if a in evaluated and b in evaluated
     ]

@@ -1,6 +1,6 @@
 """The paper's Table III from the records of a study.
 
-The text of a cell is what a reader needs; the CSV holds the same numbers in full and one unit a column.
+The text of a cell is what a reader needs; the CSV holds the same numbers in full and one unit per column.
 """
 
 from collections.abc import Mapping
@@ -21,6 +21,7 @@ from wbc_bench.results.formatting import (
     CM,
     DEG,
     NONE,
+    names_note,
     spread_text,
     tolerance_text,
     window_text,
@@ -106,7 +107,7 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
             rows.append((group, row.label, note, *[NONE] * (len(COLUMNS) + 1)))
             data.append({**base, "source": "measured", "note": note})
         else:
-            over = method.stood | terminated
+            over = method.not_terminated | terminated
             values = columns_over_replicates(method, over)
             if method.extra_signals:
                 marks[row.label] = ", ".join(method.extra_signals)
@@ -134,6 +135,7 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
     else:
         name, title = study.name, f"{study.name}: errors over episodes that did not terminate"
         notes = _paper_notes(study, evaluated)
+    notes += names_note({spec: method.name for spec, method in evaluated.items()})
     if marks:
         notes.append(
             "† reads more than the paper's policy: " + "; ".join(f"{m}: {s}" for m, s in marks.items()) + "."

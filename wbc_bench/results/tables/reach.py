@@ -13,11 +13,11 @@ from wbc_bench.results.analysis import (
     HeightRange,
     by_height,
     median,
+    not_terminated,
     oscillation,
     reach_range,
     reached,
     rule_of,
-    stood,
     strata_of,
     subset,
     variants,
@@ -26,6 +26,7 @@ from wbc_bench.results.analysis import column as series
 from wbc_bench.results.formatting import (
     CM,
     NONE,
+    names_note,
     number_text,
     tolerance_text,
     window_text,
@@ -45,7 +46,7 @@ def reach_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
     paper = study.paper
     for name, (low, high) in (paper.ranges_cm if paper else {}).items():
         place = paper.place if paper else ""
-        rows.append((f"{name}, paper ({place})", *[NONE] * 3, f"{low:g}–{high:g}", *[NONE] * 4))
+        rows.append((f"{name}, paper ({place})", *[NONE] * 4, f"{low:g}–{high:g}", *[NONE] * 3))
         data.append({"controller": name, "source": "paper", "low_cm": low, "high_cm": high})
     for spec, method in evaluated.items():
         for k, (condition, orientation, episodes) in enumerate(variants(method.episodes)):
@@ -55,8 +56,8 @@ def reach_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
             total = f"{len(episodes)}" if k else f"{len(episodes)} (run: {method.counts})"
             rows.append(
                 (
-                    *(spec if k == 0 else "", condition, orientation, total),
-                    *(_range(span), f"{span.reached}/{len(by_height(episodes))}", _range(strict)),
+                    *(method.name if k == 0 else "", condition, orientation, total),
+                    *(_range(strict), _range(span), f"{span.reached}/{len(by_height(episodes))}"),
                     " / ".join(number_text(value * CM, 1) for value in speed),
                     " / ".join(number_text(value, 2) for value in sparc),
                 )
@@ -73,18 +74,19 @@ def reach_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
                 }
             )
     header = (
-        *("Controller", "Dynamics", "Gripper", "Episodes", "Reached (cm)", "Heights reached"),
-        *("Succeeded (cm)", "EE speed RMS (cm/s) low / mid / high", "SPARC low / mid / high"),
+        *("Controller", "Dynamics", "Gripper", "Episodes", "Succeeded (cm)", "Reached (cm)"),
+        *("Heights reached", "EE speed RMS (cm/s) low / mid / high", "SPARC low / mid / high"),
     )
     notes = (
-        "Reached: the longest run of neighbouring heights at which the median position error over the "
-        f"{window_text(rule)} is below {rule.position * CM:g} cm, a terminated episode counting as "
-        "infinitely far. Succeeded: the same with more than half of the episodes inside "
-        f"{tolerance_text(rule)} at every step of that window.",
+        "Succeeded: the longest run of neighbouring heights at which more than half of the episodes are "
+        f"inside {tolerance_text(rule)} at every step of the {window_text(rule)}. Reached: the same with a "
+        f"median position error over that window below {rule.position * CM:g} cm, a terminated episode "
+        "counting as infinitely far.",
         f"Oscillation in the {window_text(rule)}, median over episodes that did not terminate: within "
         f"{END_ZONE * CM:.0f} cm of the low end of the range reached, between, within as much of the high "
         "end. SPARC is the spectral arc length of the end-effector's speed (0 is smoothest).",
         *(paper.notes if paper else ()),
+        *names_note({spec: method.name for spec, method in evaluated.items()}),
     )
     frame = pd.DataFrame(data)
     frame["episodes"] = frame["episodes"].astype("Int64") if "episodes" in frame else pd.NA
@@ -103,7 +105,7 @@ def height_table(study: Study, method: Evaluated) -> Table:
                 cells += [NONE, NONE]
                 continue
             episodes = groups[height]
-            kept = subset(episodes, stood(episodes))
+            kept = subset(episodes, not_terminated(episodes))
             rate = stats.wilson(int(series(episodes, "success").sum()), len(episodes), len(method.records))
             error = median(series(kept, "position_error"))
             terminated = len(episodes) - len(kept)
@@ -139,5 +141,5 @@ def height_table(study: Study, method: Evaluated) -> Table:
         f"median position error over the {window_text(method.rule)} of episodes that did not terminate "
         "(in brackets: how many did).",
     )
-    name, title = f"{study.name}_heights_{folder_name(method.spec)}", f"{study.name}: {method.spec} by height"
+    name, title = f"{study.name}_heights_{folder_name(method.spec)}", f"{study.name}: {method.name} by height"
     return Table(name, title, ("Height (cm)", *labels), tuple(rows), notes, pd.DataFrame(data))

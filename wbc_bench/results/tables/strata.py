@@ -64,7 +64,7 @@ def stratum_table(study: Study, evaluated: Mapping[str, Evaluated]) -> Table:
     for label, method in methods_of(study, evaluated):
         for k, (stratum, mask) in enumerate(_groups(method)[:-1]):
             for terminated in (False, True):
-                over = method.stood | terminated
+                over = method.not_terminated | terminated
                 count = defined(method, over & mask)
                 values = columns_over_replicates(method, over, mask)
                 name = "all" if terminated else "not terminated"
