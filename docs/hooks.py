@@ -1,7 +1,7 @@
 """Lets pages link to files of the repository that are not pages, as in `../results/figures/x.png`.
 
-Such a link works where the repository is read. For the site, a picture is copied beside the pages, and any other
-file becomes a link into the repository. A file that does not exist fails the build.
+Such a link works where the repository is read. For the site, a picture is copied beside the pages, and any
+other file becomes a link into the repository. A file that does not exist fails the build.
 """
 
 import re
