@@ -1,37 +1,39 @@
-# Each target sets up what it needs on a fresh machine. PYTHON=python3.12 chooses another interpreter.
+# Each target sets up what it needs on a fresh machine. PYTHON=python3.12 chooses another interpreter, VENV another folder
+# for the environment.
 PYTHON ?= python3
-BENCH := .venv/bin/wbc-bench
-# Episodes of each of the 3 replicates in `make ablation`: minutes on two cores with all four controllers.
+VENV ?= .venv
+BENCH := $(VENV)/bin/wbc-bench
+# Episodes of each of the 3 replicates in `make ablation`: minutes on two cores with all controllers of the study.
 EPISODES ?= 50
 
 .PHONY: ablation ablation-full reach rebuild test lint bench docs ci
 
-ablation: .venv/installed  ## live, EPISODES x 3 episodes a controller, into build/ablation
-	$(BENCH) ablation --seeds 3 --episodes $(EPISODES) --out build/ablation
+ablation: $(VENV)/installed  ## live, EPISODES x 3 episodes per controller, into build/ablation
+	$(BENCH) ablation --replicates 3 --episodes $(EPISODES) --out build/ablation
 
-ablation-full: .venv/installed  ## live, all 3 x 1000 episodes a controller; resumes when interrupted
-	$(BENCH) ablation --seeds 3 --out build/ablation-full
+ablation-full: $(VENV)/installed  ## live, all 3 x 1000 episodes per controller; resumes when interrupted
+	$(BENCH) ablation --replicates 3 --out build/ablation-full
 
-reach: .venv/installed  ## live, the vertical reach of the IK controller; resumes when interrupted
+reach: $(VENV)/installed  ## live, the vertical reach of the IK controller; resumes when interrupted
 	$(BENCH) reach --controller ik --out build/reach
 
-rebuild: .venv/installed  ## every table, figure and the report, from the committed records
+rebuild: $(VENV)/installed  ## every table, figure and the report, from the committed records
 	$(BENCH) report --results results
 
-test: .venv/installed
-	.venv/bin/python -m pytest
+test: $(VENV)/installed
+	$(VENV)/bin/python -m pytest
 
-lint: .venv/installed
-	.venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/pyright
+lint: $(VENV)/installed
+	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check . && $(VENV)/bin/pyright
 
-bench: .venv/installed  ## solve time of the IK controller beside other packages
+bench: $(VENV)/installed  ## solve time of the IK controller beside other packages
 	$(BENCH) bench
 
-docs: .venv/installed  ## the documentation, into site/
-	.venv/bin/mkdocs build --strict
+docs: $(VENV)/installed  ## the documentation, into site/
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 ci:
 	PYTHON=$(PYTHON) .ci/run
 
-.venv/installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv .venv && .venv/bin/pip install -q -c constraints.txt -e '.[test,bench,docs]' && touch $@
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV) && $(VENV)/bin/pip install -q -c constraints.txt -e '.[test,bench,docs]' && touch $@

@@ -1,7 +1,10 @@
-"""What the README shows works as it is printed there."""
+"""What README and documentation show works as it is printed there."""
 
 import re
+import tomllib
 from pathlib import Path
+
+import pytest
 
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
@@ -9,25 +12,65 @@ from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 
-README = Path(__file__).parents[1] / "README.md"
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [
+    README,
+    ROOT / "baselines" / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+PROGRAMS = {
+    "wbc-bench": ROOT / "wbc_bench" / "cli" / "main.py",
+    "wbc-train": ROOT / "baselines" / "wbc_baselines" / "learned" / "training" / "cli.py",
+}
 
 
-def test_the_controller_of_the_readme_runs(tmp_path: Path) -> None:
+def test_the_script_of_the_readme_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     code = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(code) == 1
-    file = tmp_path / "lean_from_readme.py"
-    file.write_text(code[0])
+    monkeypatch.chdir(ROOT)  # as its reader: in the checkout
+    short = code[0].replace('"episodes": 20', '"episodes": 2').replace("build/readme", str(tmp_path))
+    assert str(tmp_path) in short
+    exec(compile(short, str(README), "exec"), {"__name__": "__main__"})
+    printed = capsys.readouterr().out
+    assert "| examples/own_controller.py:GentleArm | 2/2 |" in printed
+    assert "## nominal_v1: A = examples/own_controller.py:GentleArm against B = ik:standing\n" in printed
+
+
+def test_the_controller_of_the_guide_runs() -> None:
     protocol, path = find_protocol("smoke_v1")
     rows, _ = read_manifest(protocol, manifest_path(path))
-    controller = load_controller(f"{file}:Lean", load_robot(protocol.robot))
+    controller = load_controller(f"{ROOT / 'docs' / 'snippets' / 'lean.py'}:Lean", load_robot(protocol.robot))
     batch = rollout(controller, protocol, rows.take(slice(2)))
     assert (batch.steps > 5).all()
     assert abs(batch.action[:, 0, 9]).max() > 0.1
 
 
-def test_every_command_of_the_readme_exists() -> None:
-    from wbc_bench.cli import main as cli
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_of_a_page_exists(page: Path) -> None:
+    code = "\n".join(re.findall(r"```.*?```|`[^`]+`", page.read_text(), re.DOTALL))
+    for program, source in PROGRAMS.items():
+        for command in re.findall(rf"\b{program} ([a-z]\w*)", code):
+            assert f'"{command}"' in source.read_text(), f"{program} {command}"
 
-    source = Path(cli.__file__).read_text()
-    for command in re.findall(r"^wbc-bench (\w+)", README.read_text(), re.MULTILINE):
-        assert f'"{command}"' in source, command
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_of_a_page_into_the_repository_leads_somewhere(page: Path) -> None:
+    text = page.read_text()
+    for link in re.findall(r'\]\(([^)#\s]+)|src="([^"]+)"', text):
+        target = "".join(link)
+        assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_all_numbers_of_a_release_agree() -> None:
+    """The version stands in four files."""
+    from wbc_bench import __version__
+
+    assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"] == __version__
+    citation = (ROOT / "CITATION.cff").read_text()
+    assert f"version: {__version__}\n" in citation
+    date = re.search(r"date-released: (\S+)", citation)
+    assert date and f"## {__version__} - {date[1]}\n" in (ROOT / "CHANGELOG.md").read_text()
