@@ -18,7 +18,7 @@ from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.evaluation.shard import evaluate_shard
 from wbc_bench.registry import spec_of_replicate
-from wbc_bench.results.analysis import collect, stood
+from wbc_bench.results.analysis import collect, not_terminated
 from wbc_bench.results.store import ResultStore
 
 EPISODES = 60
@@ -64,7 +64,7 @@ def compare(name: str, spec: str, before: pd.DataFrame, after: pd.DataFrame) -> 
     """Print and judge one controller."""
     fell = {"illegal_contact": "fell"}
     equal = before["outcome"].replace(fell) == after["outcome"].replace(fell)
-    change = (before["position_error"] - after["position_error"]).abs()[equal & stood(before)]
+    change = (before["position_error"] - after["position_error"]).abs()[equal & not_terminated(before)]
     median = float(change.median()) if len(change) else 0.0  # [m] nobody stood: nothing to compare
     ok = equal.mean() >= EQUAL_OUTCOMES and median < POSITION_CHANGE
     print(

@@ -66,7 +66,7 @@ def versions() -> dict[str, str]:
     wanted = {"wbc-bench"}
     for requirement in metadata.requires("wbc-bench") or ():
         match = re.match(r"[\w.-]+", requirement)
-        if match and not re.search(r"extra\s*==\s*.test.", requirement):
+        if match and not re.search(r"extra\s*==\s*.(test|docs).", requirement):
             wanted.add(match[0])
     found = {"python": platform.python_version()}
     for name in sorted(wanted):

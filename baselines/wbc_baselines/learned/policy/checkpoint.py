@@ -11,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
 from safetensors.torch import save as bytes_of
 
+from wbc_baselines.learned import CHECKPOINTS
 from wbc_baselines.learned.policy import inputs
 from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, card_path, check_fit, read_card
 from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
@@ -20,8 +21,6 @@ from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.files import write_atomic
 from wbc_bench.robot import Robot, load_robot
-
-CHECKPOINTS = Path(__file__).parents[1] / "checkpoints"  # METHOD@SEED.safetensors and .json
 
 
 class Checkpoint(NamedTuple):
