@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from tiny_protocol import manifest
 
+from tiny_protocol import manifest
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.episodes.randomization import nominal

@@ -4,15 +4,12 @@
 `learned:METHOD` stands for all seeds of a method: replicate k of a protocol is evaluated with seed k.
 """
 
-from pathlib import Path
-
 import msgspec
 
+from wbc_baselines.learned.packaged import CHECKPOINTS
 from wbc_bench.controller import Controller
 from wbc_bench.errors import ControllerError, missing_extra
 from wbc_bench.robot import Robot
-
-CHECKPOINTS = Path(__file__).with_name("checkpoints")  # METHOD@SEED.safetensors and .json
 
 
 class _Training(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
 from safetensors.torch import save as bytes_of
 
-from wbc_baselines.learned import CHECKPOINTS
+from wbc_baselines.learned.packaged import CHECKPOINTS
 from wbc_baselines.learned.policy import inputs
 from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, card_path, check_fit, read_card
 from wbc_baselines.learned.policy.estimators import Estimator, make_estimator

@@ -17,13 +17,13 @@ import pyarrow.parquet as pq
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
+from wbc_baselines.learned.packaged import TARGET_SETS
 from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
 from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.outcomes import STRATA
 
 SEED_OFFSET = 2**62  # added to the protocol's seed, so that no evaluation uses the same random stream
-TARGET_SETS = Path(__file__).parents[1] / "target_sets"  # ships with the package
 CHUNK = 30  # targets per task, about a second of work
 
 Progress = Callable[[int, int], None]  # (done, total)

@@ -1,0 +1,6 @@
+"""Where the files that ship with the learned controllers are; importing it needs no package of theirs."""
+
+from pathlib import Path
+
+CHECKPOINTS = Path(__file__).with_name("checkpoints")  # METHOD@SEED.safetensors and .json
+TARGET_SETS = Path(__file__).with_name("target_sets")  # PROTOCOL.parquet

@@ -1,0 +1,1 @@
+from live_page import served  # noqa: F401  (a fixture)

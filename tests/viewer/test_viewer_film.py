@@ -1,0 +1,70 @@
+"""A film and a strip show the episode that was recorded, on machines that can draw."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runs import evaluated
+from wbc_bench.errors import BenchError
+from wbc_bench.viewer import film
+from wbc_bench.viewer.rerun import Rerun, rerun
+
+
+@pytest.fixture(scope="module")
+def again(tmp_path_factory: pytest.TempPathFactory) -> Rerun:
+    return rerun(evaluated(tmp_path_factory.mktemp("store"), "hold", episodes=2), 0)
+
+
+@pytest.fixture(scope="module")
+def strip(again: Rerun) -> film.Pixels:
+    try:
+        return film.strip_of(again, times=[0.0, 1.0, 99.0])
+    except BenchError as error:
+        pytest.skip(str(error))
+
+
+def test_a_strip_shows_the_moments_asked_for(again: Rerun, strip: film.Pixels) -> None:
+    width, height = film.PANEL
+    assert strip.shape == (height, 3 * width + 2 * film.GAP, 3)
+    first, middle, last = (strip[:, k * (width + film.GAP) :][:, :width].astype(int) for k in range(3))
+    assert np.abs(first - middle).max() > 50  # the robot has moved
+    end = film.strip_of(again, times=[again.moments[-1].time])
+    assert np.abs(last - end).max() <= 2  # of 255: a renderer rounds with what it drew before
+    assert np.array_equal(strip, film.strip_of(again, times=[0.0, 1.0, 99.0]))
+    # the ball of the tolerance is orange, for `hold` does not get there
+    red, green, blue = np.moveaxis(first, -1, 0)
+    assert ((red > 180) & (red - green > 40) & (green - blue > 20)).sum() > 30
+
+
+def test_the_caption_of_a_strip_names_episode_end_and_times(again: Rerun) -> None:
+    end = f"{again.moments[-1].time:g}"
+    caption = film.strip_caption(again, times=[0.0, 99.0])
+    assert caption.startswith(f"{again.title}: {again.stored['outcome']}. At 0, {end} s;")
+    assert film.strip_caption(again).count(",") >= film.PANELS
+
+
+def test_everything_that_matters_is_in_the_picture(again: Rerun, strip: film.Pixels) -> None:
+    half = np.array([0.5, 0.4])
+    view = film._view(again.moments, half)
+    turn, tilt = np.deg2rad([view.azimuth, view.elevation])
+    ahead = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+    eye = view.lookat - view.distance * ahead
+    edge = 0.0
+    for moment in again.moments:
+        for place in (moment.ee_pos_w, moment.target_pos_w, *moment.foot_pos_w):
+            depth = (place - eye) @ ahead
+            right = np.array([np.sin(turn), -np.cos(turn), 0.0])
+            place_in_view = np.abs([(place - eye) @ right, (place - eye) @ np.cross(right, ahead)])
+            edge = max(edge, (place_in_view / depth / half).max())
+    assert 0.5 < edge < 1.0  # near, and nothing cut off
+
+
+def test_a_film_has_a_picture_every_other_step(again: Rerun, strip: film.Pixels, tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path, seen = tmp_path / "episode.mp4", []
+    film.write_film_of(again, path, lambda done, total, what: seen.append((done, total)))
+    frames, seconds = ffmpeg.count_frames_and_secs(str(path))
+    assert frames == -(-len(again.moments) // film.EVERY) == len(seen)
+    assert seconds == pytest.approx(frames / 25, abs=0.05)
+    assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
