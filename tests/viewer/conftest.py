@@ -1,1 +1,0 @@
-from live_page import served  # noqa: F401  (a fixture)
