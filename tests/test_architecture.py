@@ -124,6 +124,13 @@ def test_results_need_neither_physics_nor_learning():
         assert not reaches(module) & set(HEAVY), module
 
 
+def test_every_module_is_short_and_says_what_it_is_for():
+    for module, path in MODULES.items():
+        text = path.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 400, module
+        assert path.name == "__init__.py" or ast.get_docstring(ast.parse(text)), module
+
+
 def test_the_command_line_starts_light():
     """`wbc-bench --help` must not wait for numpy, let alone MuJoCo."""
     heavy = (*HEAVY, "numpy", "pandas", "scipy", "matplotlib", "joblib", "sklearn")

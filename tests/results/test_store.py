@@ -15,7 +15,8 @@ from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import ensure_writable, folder_name, write_atomic
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
-from wbc_bench.results.store import ResultStore, RunKey, RunWriter, ShardCost
+from wbc_bench.results.run_writer import RunWriter
+from wbc_bench.results.store import ResultStore, RunKey, ShardCost
 
 FACTS = {
     **{"controller_name": "a", "signals": [], "source": "test", "checkpoint_sha256": None},

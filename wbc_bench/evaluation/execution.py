@@ -21,7 +21,8 @@ from wbc_bench.outcomes import SuccessRule
 from wbc_bench.progress import Progress
 from wbc_bench.provenance import Software
 from wbc_bench.registry import build_controller, spec_of_replicate
-from wbc_bench.results.store import ResultStore, Run, RunKey, RunWriter
+from wbc_bench.results.run_writer import RunWriter
+from wbc_bench.results.store import ResultStore, Run, RunKey
 from wbc_bench.robot import load_robot
 
 
