@@ -75,6 +75,17 @@ def test_pushes_keep_to_the_schedule() -> None:
     assert np.isnan(time).all() and (vel == 0).all()
 
 
+@pytest.mark.parametrize("horizon", [10.0, 26.0, 60.0])
+def test_pushes_last_as_long_as_an_episode(horizon: float) -> None:
+    """The last push and the quiet end are never further apart than an interval."""
+    push = Push(speed=0.5, interval=(4.0, 6.0), quiet_end=2.0)
+    for i in range(50):
+        time, vel = draw_pushes(push, horizon, stream(2, "push", i))
+        times = time[np.isfinite(time)]
+        assert len(vel) == 2 * len(time) and (np.diff(times) >= 4.0).all()
+        assert horizon - 2.0 - 6.0 <= times[-1] < horizon - 2.0
+
+
 def test_the_nominal_robot_is_at_rest_and_undisturbed() -> None:
     calm = nominal(SMOKE, 0, 4)
     robot = load_robot()

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from wbc_bench.episodes.single import free_episode
-from wbc_bench.viewer.session import LONGEST, Session
+from wbc_bench.episodes.single import LONGEST, free_episode
+from wbc_bench.viewer.session import Session
 
 
 def session_of(spec: str, source: str, condition: str = "nominal", seed: int = 0) -> Session:

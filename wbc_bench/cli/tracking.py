@@ -132,9 +132,9 @@ class Live:
     """Let other machines open the page, and move the robot."""
 
     def run(self) -> None:
-        from wbc_bench.episodes.single import free_episode
+        from wbc_bench.episodes.single import LONGEST, free_episode
         from wbc_bench.viewer.live import serve
-        from wbc_bench.viewer.session import LONGEST, Session
+        from wbc_bench.viewer.session import Session
 
         check_port(self.port)
         not_negative("--seed", self.seed)

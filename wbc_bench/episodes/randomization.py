@@ -3,6 +3,7 @@
 Each quantity has a stream of its own, so that switching one off leaves the others as they are.
 """
 
+import math
 from functools import cache
 from typing import NamedTuple
 
@@ -28,8 +29,8 @@ class EpisodeDraws(NamedTuple):
     leg_qd: Array  # (8,) [rad/s]
     kp_scale: Array  # (14,)
     kd_scale: Array  # (14,)
-    push_time: Array  # (MAX_PUSHES,) [s], NaN for none
-    push_vel: Array  # (2 * MAX_PUSHES,) [m/s], zero for none
+    push_time: Array  # (P,) [s], NaN for none; P is MAX_PUSHES in a manifest, see `draw_pushes`
+    push_vel: Array  # (2 * P,) [m/s], zero for none
     noise_key: int
     noise_scale: float
 
@@ -84,12 +85,15 @@ def noise_key(protocol: EvalProtocol, replicate: int, episode: int) -> int:
 
 
 def draw_pushes(push: Push, horizon: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Times (MAX_PUSHES,) [s], NaN for none, and velocity jumps (2 * MAX_PUSHES,) [m/s], x and y of each.
+    """Times (P,) [s], NaN for none, and velocity jumps (2 * P,) [m/s], x and y of each.
 
-    One interval after the start, one after each push, none in the quiet end.
+    One interval after the start, one after each push, none in the quiet end. P is MAX_PUSHES, the columns of
+    a manifest, or as many as fit into an episode that no manifest holds and that lasts longer.
     """
-    intervals = rng.uniform(*push.interval, MAX_PUSHES)
-    velocity = rng.uniform(-push.speed, push.speed, 2 * MAX_PUSHES)
+    room = math.ceil((horizon - push.quiet_end) / push.interval[0]) - 1
+    most = max(MAX_PUSHES, room)
+    intervals = rng.uniform(*push.interval, most)
+    velocity = rng.uniform(-push.speed, push.speed, 2 * most)
     time = np.cumsum(intervals)
     none = (time >= horizon - push.quiet_end) | (push.speed == 0)
     return np.where(none, np.nan, time), np.where(np.repeat(none, 2), 0.0, velocity)

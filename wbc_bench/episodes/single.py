@@ -1,7 +1,6 @@
 """One episode that no manifest holds: free of a target, for a source or a person to lead."""
 
 import dataclasses
-import math
 
 import msgspec
 import numpy as np
@@ -14,6 +13,7 @@ from wbc_bench.errors import SourceError, UnknownNameError
 CONDITIONS = ("nominal", "randomised")
 BASE_PROTOCOL = "ablation_v1"  # whose physics, randomisation, noise, pushes and limits hold
 UNSCRIPTED = 20.0  # [s] for a source that has no end
+LONGEST = 600.0  # [s] the noise and the pushes of a whole episode are drawn in advance
 
 
 def door_protocol(seed: int) -> EvalProtocol:
@@ -49,8 +49,8 @@ def free_episode(
 
 def _protocol(duration: float, seed: int, base: str = BASE_PROTOCOL) -> EvalProtocol:
     protocol, _ = find_protocol(base)
-    if not math.isfinite(duration) or duration < protocol.control_period:
-        raise SourceError(f"duration {duration:g} s, valid: {protocol.control_period:g} s or more")
+    if not protocol.control_period <= duration <= LONGEST:
+        raise SourceError(f"duration {duration:g} s, valid: {protocol.control_period:g} to {LONGEST:g} s")
     episodes = msgspec.structs.replace(
         protocol.episodes, replicates=1, per_replicate=1, horizon=duration, seed=seed
     )

@@ -18,8 +18,6 @@ from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.live import LiveSource
 from wbc_bench.viewer.moment import PUSH_SECONDS, Array, Moment, moment_of
 
-LONGEST = 600.0  # [s] of an episode without an end: the noise of a whole one is drawn in advance
-
 
 class Session:
     """Steps a robot for as long as it stands; `moment` is the present one."""
