@@ -30,6 +30,7 @@ from wbc_bench.results.tracking import (
 from wbc_bench.robot import load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 from wbc_bench.sources import Seen, StampedTarget, load_source
+from wbc_bench.sources.registry import find_policy, find_script, recorded_name
 
 PERIOD = 0.02  # [s]
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -234,6 +235,24 @@ def test_the_table_means_over_seeds(tmp_path: Path) -> None:
     mean = np.mean([tracked(delay).position_error.mean() for delay in (0.2, 0.4)])
     assert ik["Pos. mean ↓ (cm)"] == f"{mean * 100:.2f}"
     assert "figure\\_eight" in table.latex() and table.csv().startswith("source,controller,condition,runs,")
+
+
+def test_equal_runs_of_several_seeds_count_once(tmp_path: Path) -> None:
+    for seed in range(3):
+        write_track(tmp_path, tracked(0.2), **FACTS | {"seed": seed})
+    table = tracking_table(read_tracks(tmp_path))
+    assert dict(zip(table.header, table.rows[0], strict=True))["Stood"] == "1/1"
+
+
+def test_scripts_of_one_name_are_recorded_apart(tmp_path: Path) -> None:
+    shipped = find_script("figure_eight")
+    assert recorded_name("figure_eight", shipped.digest) == "figure_eight"
+    assert recorded_name("stream:figure_eight", shipped.digest) == "stream:figure_eight"
+    assert recorded_name("figure_eight", "0123456789") == "figure_eight@01234567"
+    assert recorded_name("mine", "0123456789") == "mine@01234567"
+    assert recorded_name("stream", None) == "stream"
+    assert recorded_name("diffusion", find_policy()[2]) == "diffusion"
+    assert recorded_name("diffusion", "0123456789") == "diffusion@01234567"
 
 
 def test_the_figure_is_the_same_for_the_same_runs(tmp_path: Path) -> None:

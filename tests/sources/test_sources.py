@@ -156,6 +156,7 @@ pos = [0.4, 0.0, 1.0]
         ('type = "waypoints"', 'type = "spiral"', "$.path.type"),
         ('name = "x"', 'name = "x"\nframe = "camera"', "$.frame"),
         ("[limits]", "[limits", ""),
+        ('name = "x"', 'name = "---"', "$.name"),
         (
             GOOD[GOOD.index("type") :],
             'type = "curve"\ncentre = [0.4, 0.0, 1.0]\namplitude = [0.1, 0.0, 0.0]\ncycles = [0, 1, 1]\n',

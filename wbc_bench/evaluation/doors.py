@@ -23,7 +23,7 @@ from wbc_bench.sources.diffusion.demonstrations import Demonstration, write_demo
 from wbc_bench.sources.diffusion.expert import ExpertSource
 from wbc_bench.sources.diffusion.scene import CLOSED, Door, draw_door
 from wbc_bench.sources.interface import SceneSource
-from wbc_bench.sources.registry import find_policy
+from wbc_bench.sources.registry import find_policy, recorded_name
 from wbc_bench.sources.slew import Pose
 
 Array = NDArray[np.float64]
@@ -124,7 +124,7 @@ def evaluate(
     return write_doors(
         root,
         episode_table(episodes),
-        source="expert" if policy is None else "diffusion",
+        source="expert" if policy is None else recorded_name("diffusion", digest),
         policy_sha256=digest,
         controller=spec,
         signals=sorted(controller.info.signals),

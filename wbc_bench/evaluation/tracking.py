@@ -20,6 +20,7 @@ from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
+from wbc_bench.sources.registry import recorded_name
 from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import ScriptedSource
 
@@ -132,9 +133,10 @@ def _digest(source: Source) -> str | None:
 
 def facts(controller: Controller, spec: str, source: Source, condition: str, seed: int) -> dict:
     """What the record of a run says beside its series."""
+    digest = _digest(source)
     return {
-        "source": source.name,
-        "source_sha256": _digest(source),
+        "source": recorded_name(source.name, digest),
+        "source_sha256": digest,
         "controller": spec,
         "signals": sorted(controller.info.signals),
         "condition": condition,

@@ -253,7 +253,9 @@ def tracking_table(tracks: list[Track], labels: Mapping[str, str] | None = None)
     for track in tracks:
         groups.setdefault(_key(track.record)[:3], []).append(track)
     rows, data, before = [], [], None
-    for (source, controller, condition), runs in groups.items():
+    for (source, controller, condition), same in groups.items():
+        # undisturbed runs of several seeds are one run: equal series count once
+        runs = list({run.record.series_sha256: run for run in same}.values())
         values = {name: _mean([getattr(score(run.tracked), name) for run in runs]) for name in Scores._fields}
         stood = sum(run.record.outcome == STOOD for run in runs)
         completed, requested = (

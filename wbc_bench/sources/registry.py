@@ -1,5 +1,6 @@
 """A source by its name."""
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,22 @@ def find_script(name: str) -> Script:
     if name not in script_names():
         raise UnknownNameError("source", name, source_names(), "--source; or give a .toml file")
     return load_script(SCRIPTS / f"{name}.toml")
+
+
+def recorded_name(name: str, digest: str | None) -> str:
+    """The name of a source in a record: what does not ship under a name carries the beginning of its digest.
+
+    So two scripts or two policies of one name never replace each other, and are never averaged.
+    """
+    if digest is None or digest in _shipped_digests(name.removeprefix("stream:")):
+        return name
+    return f"{name}@{digest[:8]}"
+
+
+def _shipped_digests(name: str) -> set[str]:
+    if name == "diffusion":
+        return {hashlib.sha256(POLICY.read_bytes()).hexdigest()}
+    return {find_script(name).digest} if name in script_names() else set()
 
 
 def check_source(name: str) -> None:

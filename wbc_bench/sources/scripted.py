@@ -130,6 +130,9 @@ def _check(script: Script, path: File) -> None:
     def refuse(problem: str, where: str) -> NoReturn:
         raise SourceError(f"source {path}: {problem} - at `${where}`")
 
+    if not any(c.isascii() and c.isalnum() for c in script.name):
+        refuse(f"'{script.name}' cannot name a record, valid: at least one ASCII letter or digit", ".name")
+
     def walk(value: object, where: str) -> None:
         if isinstance(value, msgspec.Struct):
             for field in value.__struct_fields__:
