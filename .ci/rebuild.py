@@ -1,5 +1,9 @@
-"""Rebuild every table, figure and the report from the committed records, and compare byte for byte."""
+"""Rebuild every table, figure and the report from the committed records, and compare byte for byte.
 
+Records of a release are made from a clean commit: one that says otherwise is a problem, too.
+"""
+
+import json
 import shutil
 import sys
 import tempfile
@@ -14,6 +18,15 @@ def products(root: Path) -> dict[str, bytes]:
     """Path below `root` -> bytes of everything that is made from records."""
     paths = [*root.glob("tables/**/*"), *root.glob("figures/**/*"), *root.glob("report.html")]
     return {str(path.relative_to(root)): path.read_bytes() for path in paths if path.is_file()}
+
+
+def dirty(root: Path) -> list[Path]:
+    """The records below `root` that do not say that their commit was clean."""
+    return [
+        path
+        for path in sorted(root.rglob("run.json"))
+        if json.loads(path.read_text())["git_dirty"] is not False
+    ]
 
 
 def main() -> int:
@@ -33,6 +46,7 @@ def main() -> int:
     problems += [f"not committed: {name}" for name in sorted(rebuilt.keys() - committed.keys())]
     both = sorted(rebuilt.keys() & committed.keys())
     problems += [f"differs: {name}" for name in both if rebuilt[name] != committed[name]]
+    problems += [f"made from a dirty commit: {path}" for path in dirty(results)]
     print(*problems, f"{len(both)} files compared, {len(problems)} problems", sep="\n")
     return 1 if problems else 0
 
