@@ -2,7 +2,7 @@
 
 import hashlib
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -25,7 +25,29 @@ def read_toml(path: Path, schema: type[T], kind: str, error: type[BenchError]) -
 
 
 def meaning_digest(struct: msgspec.Struct) -> str:
-    """SHA-256 over the canonical JSON of every field but the description."""
-    fields = msgspec.to_builtins(struct)
-    del fields["description"]
+    """SHA-256 over the canonical JSON of what a struct means: every field but the description.
+
+    A field in `LATER` of its struct is left out while it has its default: it joined the schema after files of
+    it were released, whose digests must stay what they are.
+    """
+    fields = meaning(struct)
+    fields.pop("description", None)
     return hashlib.sha256(msgspec.json.encode(fields, order="deterministic")).hexdigest()
+
+
+def meaning(value: Any) -> Any:
+    """What a struct means in the types of JSON, as `meaning_digest` takes it."""
+    if isinstance(value, tuple):
+        return [meaning(item) for item in value]
+    if not isinstance(value, msgspec.Struct):
+        return msgspec.to_builtins(value)
+    later = getattr(type(value), "LATER", frozenset())
+    found = {}
+    for field in msgspec.structs.fields(value):
+        item = getattr(value, field.name)
+        if field.name not in later or item != field.default:
+            found[field.encode_name] = meaning(item)
+    config = type(value).__struct_config__
+    if config.tag is not None:
+        found[config.tag_field] = config.tag
+    return found

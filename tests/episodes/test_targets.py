@@ -53,10 +53,12 @@ def test_two_links_close_the_chain() -> None:
     np.testing.assert_allclose(bend[0], -bend[1])
 
 
+@pytest.mark.parametrize("variant", ["limx_adapter", "paper"])
 @pytest.mark.parametrize("mount", ["limx_adapter", "pc_stack"])
-@pytest.mark.parametrize("tcp", ["sdk_L5_umi", "umi_on_tron_das_camera"])
-def test_closed_form_arm_inverts_mujoco(mount: str, tcp: str) -> None:
-    solver = StaticSolver(load_robot(RobotConfig(mount=mount, tcp=tcp)), 0.02, 1.25, 0.3)
+@pytest.mark.parametrize("tcp", ["sdk_L5_umi", "umi_on_tron_das_camera", "umi_on_tron_das_optical"])
+def test_closed_form_arm_inverts_mujoco(variant: str, mount: str, tcp: str) -> None:
+    config = RobotConfig(variant=variant, mount=mount, tcp=tcp)
+    solver = StaticSolver(load_robot(config), 0.02, 1.25, 0.3)
     robot, rng = solver.robot, np.random.default_rng(1)
     arm = slice(NUM_LEG_JOINTS, None)
     for _ in range(50):

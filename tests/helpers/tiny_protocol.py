@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, write_manifest
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, neutral, write_manifest
 from wbc_bench.episodes.protocol import MAX_PUSHES, read_protocol
 
 TOML = """
@@ -43,6 +43,7 @@ def manifest(replicates: int, episodes: int) -> EpisodeManifest:
     count = replicates * episodes
     rng = np.random.default_rng(0)
     return EpisodeManifest(
+        **neutral(count),
         replicate=np.repeat(np.arange(replicates), episodes),
         episode=np.tile(np.arange(episodes), replicates),
         stratum=np.full(count, "arm", dtype=object),

@@ -10,7 +10,7 @@ from wbc_baselines.learned.training.backends.base import ResetState
 from wbc_baselines.learned.training.target_set import (
     read_target_set,
 )
-from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.manifest import EpisodeManifest, neutral
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, find_protocol
 
 PROTOCOL = find_protocol("ablation_v1")[0]
@@ -27,6 +27,7 @@ def manifest_of(start: ResetState, target: np.ndarray) -> EpisodeManifest:
     """A manifest of the same episodes as a training start's."""
     count = len(start.friction)
     columns: dict[str, Any] = {field.name: np.zeros(count) for field in fields(EpisodeManifest)}
+    columns |= neutral(count)
     columns |= {name: column.numpy() for name, column in start._asdict().items()}
     columns |= {
         "target_pos_w": TARGETS.pos_w[target].astype(float),

@@ -16,7 +16,13 @@ from wbc_bench.viewer import picture
 
 FACTS = load_facts()
 NUM_SAMPLES = 20
-PAIRS = list(itertools.product(FACTS.mounts, FACTS.tcp.variants))
+CONFIGS = [
+    *(
+        RobotConfig(mount=mount, tcp=tcp)
+        for mount, tcp in itertools.product(FACTS.mounts, FACTS.tcp.variants)
+    ),
+    *(RobotConfig(variant=variant) for variant in FACTS.variants),
+]
 GRAVITY = 9.81
 
 
@@ -62,10 +68,9 @@ class Both:
         return self.data.oMf[self.model.getFrameId(name)]
 
 
-@pytest.fixture(scope="module", params=PAIRS, ids=lambda pair: "-".join(pair))
+@pytest.fixture(scope="module", params=CONFIGS, ids=lambda c: "-".join([c.variant, c.mount, c.tcp]))
 def both(request: pytest.FixtureRequest) -> Both:
-    mount, tcp = request.param
-    return Both(load_robot(RobotConfig(mount=mount, tcp=tcp)))
+    return Both(load_robot(request.param))
 
 
 def samples(both: Both):
@@ -249,9 +254,9 @@ def test_a_wrong_facts_file_names_the_field(tmp_path: Path) -> None:
     wrong = tmp_path / "facts.toml"
     wrong.write_text(text.replace("mass = 9.585", 'mass = "heavy"'))
     with pytest.raises(ProtocolError, match=r"facts.toml.*links\[0\]\.mass"):
-        load_facts(wrong)
+        load_facts(path=wrong)
     with pytest.raises(ProtocolError, match=r"nowhere\.toml"):
-        load_facts(tmp_path / "nowhere.toml")
+        load_facts(path=tmp_path / "nowhere.toml")
 
 
 def test_exported_xml_is_the_same_robot() -> None:

@@ -12,17 +12,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Robot:
+    variant: str = "limx_adapter"
+    """Name of the robot's build: limx_adapter, or paper for the one of the paper's public code."""
     mount: str = ""
-    """Name of the place where the arm is mounted; the default of the robot's facts file when not given."""
+    """Name of the place where the arm is mounted; that of the variant when not given."""
     tcp: str = ""
-    """Name of the end-effector frame; the default of the robot's facts file when not given."""
+    """Name of the end-effector frame; that of the variant when not given."""
     ankle_effort: float | None = None
-    """Torque limit of the ankles [N m]; that of the robot's facts file when not given."""
+    """Torque limit of the ankles [N m]; that of the variant when not given."""
 
     def _config(self) -> "RobotConfig":
         from wbc_bench.robot import RobotConfig
 
-        return RobotConfig(mount=self.mount, tcp=self.tcp, ankle_effort=self.ankle_effort)
+        return RobotConfig(
+            variant=self.variant, mount=self.mount, tcp=self.tcp, ankle_effort=self.ankle_effort
+        )
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ Its digest covers the meaning of the file, not its layout or comments.
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import Annotated, ClassVar, Literal, NoReturn
 
 import msgspec
 
@@ -20,6 +20,10 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 Range = tuple[float, float]  # (low, high)
+PositiveRange = tuple[Positive, Positive]
+Delay = Annotated[float, msgspec.Meta(ge=0, le=0.2)]  # [s] more than any control stack has
+Angle = Annotated[float, msgspec.Meta(ge=0, le=0.5)]  # [rad] beyond it nothing stands
+DelayRange = tuple[Delay, Delay]
 
 MAX_PUSHES = 2  # columns of a manifest; `read_protocol` refuses a schedule with room for more
 
@@ -40,8 +44,11 @@ class Episodes(_Table, frozen=True):
 class Physics(_Table, frozen=True):
     """PD runs at every physics step; the controller at every `decimation`-th."""
 
+    LATER: ClassVar[frozenset[str]] = frozenset({"cone"})
+
     timestep: Positive = 0.002  # [s]
     decimation: Count = 10
+    cone: Literal["elliptic", "pyramidal"] = "elliptic"  # of the friction; docs/protocols.md says why
 
 
 class WorkspaceTargets(_Table, frozen=True, tag="workspace"):
@@ -110,7 +117,26 @@ class ReachTargets(_Table, frozen=True, tag="reach"):
 
 
 class Randomization(_Table, frozen=True):
-    """Ranges of the uniform draws of an episode. Source: the paper names the quantities, not the ranges."""
+    """Ranges of the uniform draws of an episode. Source: the paper names the quantities, not the ranges.
+
+    What came later, from `command_delay` on, is constant through an episode and hidden from the controller.
+    """
+
+    LATER: ClassVar[frozenset[str]] = frozenset(
+        {
+            "command_delay",
+            "observation_delay",
+            "odometry_delay",
+            "odometry_drift",
+            "payload",
+            "payload_offset",
+            "motor_strength",
+            "joint_offset",
+            "gravity_tilt",
+            "slope",
+            "step_height",
+        }
+    )
 
     friction: Range = (0.8, 0.8)  # sliding coefficient
     base_mass: Range = (0.0, 0.0)  # [kg] added to the base
@@ -119,14 +145,37 @@ class Randomization(_Table, frozen=True):
     leg_q: NonNegative = 0.0  # [rad] about the default posture
     leg_qd: NonNegative = 0.0  # [rad/s]
     gain: Range = (1.0, 1.0)  # factor on kp and on kd, one a joint
+    command_delay: DelayRange = (0.0, 0.0)  # [s] from a command to the motors, in whole physics steps
+    observation_delay: DelayRange = (0.0, 0.0)  # [s] age of proprioception and end-effector pose
+    odometry_delay: DelayRange = (
+        0.0,
+        0.0,
+    )  # [s] age of the base pose that places the target
+    odometry_drift: NonNegative = 0.0  # [m/sqrt(s)] random walk of that pose, along each axis
+    payload: tuple[NonNegative, NonNegative] = (0.0, 0.0)  # [kg] point mass in the hand
+    payload_offset: NonNegative = 0.0  # [m] of the point from the end-effector, each axis +-
+    motor_strength: PositiveRange = (1.0, 1.0)  # factor on the torque limits, one for all joints
+    joint_offset: NonNegative = 0.0  # [rad] error of the encoders, each joint +-
+    gravity_tilt: Angle = 0.0  # [rad] of the IMU about a horizontal axis
+    slope: Angle = 0.0  # [rad] steepest slope of the ground
+    step_height: Annotated[float, msgspec.Meta(ge=0, le=0.2)] = 0.0  # [m] highest bump of an uneven ground
 
 
 class Push(_Table, frozen=True):
-    """Jumps of the base's horizontal velocity."""
+    """Jumps of the base's velocity."""
+
+    LATER: ClassVar[frozenset[str]] = frozenset({"vertical_speed", "angular_speed"})
 
     speed: NonNegative = 0.0  # [m/s] each axis +-; 0 for no pushes
     interval: tuple[Positive, Positive] = (4.0, 6.0)  # [s]
     quiet_end: NonNegative = 2.0  # [s] at the end of an episode without a push
+    vertical_speed: NonNegative = 0.0  # [m/s] +-
+    angular_speed: NonNegative = 0.0  # [rad/s] each axis of the base +-
+
+    @property
+    def some(self) -> bool:
+        """Whether there are pushes at all."""
+        return self.speed > 0 or self.vertical_speed > 0 or self.angular_speed > 0
 
 
 class Noise(_Table, frozen=True):
@@ -274,17 +323,20 @@ def _check(protocol: EvalProtocol, path: Path) -> None:
     for name in ("friction", "gain"):
         if getattr(spread, name)[0] <= 0:
             refuse(f"low {getattr(spread, name)[0]:g} must be positive", f"randomization.{name}")
-    lightest = -next(link.mass for link in load_facts().links if link.name == load_facts().base)
+    facts = load_facts(protocol.robot.variant)
+    lightest = -next(link.mass for link in facts.links if link.name == facts.base)
     if spread.base_mass[0] <= lightest:
         refuse(
             f"low {spread.base_mass[0]:g} kg leaves no base, valid: above {lightest:g} kg",
             "randomization.base_mass",
         )
-    if push.speed > 0 and (MAX_PUSHES + 1) * push.interval[0] < horizon - push.quiet_end - 1e-9:
+    if push.some and (MAX_PUSHES + 1) * push.interval[0] < horizon - push.quiet_end - 1e-9:
         refuse(
             f"{push.interval[0]:g} s leaves room for more than {MAX_PUSHES} pushes an episode",
             "push.interval",
         )
 
+    if spread.step_height > 0 and "nominal" in getattr(targets, "conditions", ()):
+        refuse("nominal episodes have a level floor, and one model serves all", "randomization.step_height")
     for problem, where in targets.mistakes(protocol.episodes):
         refuse(problem, where)

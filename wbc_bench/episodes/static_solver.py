@@ -98,11 +98,13 @@ class StaticSolver:
         self.hull_low = np.array([self._ankle[0] + foot.x[0], -half_width])  # (2,) [m]
         self.hull_high = np.array([self._ankle[0] + foot.x[1], half_width])
 
-        mount, tcp = np.array(mount_of(facts, config).xyz), np.array(tcp_of(facts, config).xyz)
+        mount, frame = np.array(mount_of(facts, config).xyz), tcp_of(facts, config)
+        tcp, self._tcp_rot = np.array(frame.xyz), matrix_from_rpy(np.array(frame.rpy))
         self._arm_root = mount + xyz["J1"]
         self._shoulder, self._upper = xyz["J2"][[0, 2]], xyz["J3"][[0, 2]]
         self._forearm = xyz["J4"][[0, 2]]
-        self._wrist = xyz["J5"] + [0.0, 0.0, xyz["J6"][2]]  # where the axes of J5 and J6 meet, from J4
+        # where the axes of J5 and J6 meet, from J4; J4 turns about y, so its own offset along y adds to it
+        self._wrist = xyz["J5"] + [0.0, xyz["J4"][1], xyz["J6"][2]]
         self._wrist_to_tcp = tcp + np.array([xyz["J6"][0], 0.0, 0.0])
         links = {link.name: link for link in facts.links}
         self._arm = [
@@ -167,6 +169,7 @@ class StaticSolver:
         Returns:
             J1..J6 (4, N, 6) [rad], NaN where there is none, and the elbow's bend (4, N) [rad].
         """
+        rot_b = rot_b @ self._tcp_rot.T  # of the last link
         wrist = pos_b - rot_b @ self._wrist_to_tcp - self._arm_root
         radius = np.hypot(wrist[:, 0], wrist[:, 1])
         # the wrist stays at a fixed lateral offset from the plane of the arm
@@ -214,7 +217,7 @@ class StaticSolver:
 
     def _best(self, bodies: _Bodies, pos: Array, rot: Array) -> Witness | None:
         x, z, pitch = bodies.base.T
-        wrist = pos - rot @ self._wrist_to_tcp
+        wrist = pos - rot @ self._tcp_rot.T @ self._wrist_to_tcp
         root_x, root_z = np.moveaxis(turn(pitch, self._arm_root[[0, 2]] + [0.0, self._shoulder[1]]), -1, 0)
         apart = (wrist[0] - x - root_x) ** 2 + wrist[1] ** 2 + (wrist[2] - z - root_z) ** 2
         near = np.flatnonzero(apart <= self._reach**2)

@@ -11,6 +11,7 @@ from wbc_bench.controller import Controller, JointCommand, ProtocolAware, Target
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, ControllerError, fault_of
+from wbc_bench.evaluation.delays import LateStates, physics_steps
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.outcomes import Outcome
@@ -28,7 +29,11 @@ class StepResult(NamedTuple):
 
 
 class ControlLoop:
-    """Observe, act, push, step, and end what has fallen. `state` and `observation` are the present ones."""
+    """Observe, act, push, step, and end what has fallen.
+
+    `state` and `observation` are the present ones, `odometry` is the state by which a target in the world is
+    put into the base frame: of some time ago, where the episodes' odometry is late.
+    """
 
     def __init__(
         self,
@@ -53,26 +58,36 @@ class ControlLoop:
         self._push_step = np.full(rows.push_time.shape, -1)
         planned = np.isfinite(rows.push_time)
         self._push_step[planned] = np.round(rows.push_time[planned] / period)
-        self._push_vel = rows.push_vel.reshape(count, -1, 2)
+        parts = (rows.push_vel, 2), (rows.push_vel_z, 1), (rows.push_ang_vel, 3)
+        self._push_vel = np.concatenate([part.reshape(count, -1, width) for part, width in parts], axis=2)
 
         self.step = 0  # control steps taken
         self.ended = np.full(count, RUNNING, dtype=object)  # (N,) how, or RUNNING
         self.active = np.ones(count, dtype=bool)
         self.state: State = self.simulation.state()
-        self.observation = self.sensors.observe(0, 0.0, self.state, self.active)
+        physics = protocol.physics
+        self._late = [
+            LateStates[State](physics_steps(delay, physics.timestep), physics.decimation)
+            for delay in (rows.observation_delay, rows.odometry_delay)
+        ]
+        self._see()
 
     def run(self) -> Iterator[StepResult]:
         """Step towards the manifest's targets, until all episodes have ended or their time is up.
 
         Raises: see `advance`.
         """
-        target = self.sensors.target(self.state)
+        target = self.sensors.target(self.odometry)
         self.reset(target)
         for _ in range(self._protocol.num_steps):
             yield self.advance(target)
             if not self.active.any():
                 return
-            target = self.sensors.target(self.state)
+            target = self.sensors.target(self.odometry, self.step)
+
+    def target(self, pos_w: NDArray[np.float64], rot_w: NDArray[np.float64]) -> Target:
+        """Poses (N, 3) [m], (N, 3, 3) in the world as the odometry of each robot puts them into its base."""
+        return self.sensors.in_base(self.odometry, pos_w, rot_w, self.step)
 
     def reset(self, target: Target) -> None:
         """Tell the controller what it begins with."""
@@ -125,15 +140,21 @@ class ControlLoop:
         if pushed.any():
             mask = pushed[..., None] & active[:, None, None]
             self.simulation.push(np.where(mask, self._push_vel, 0.0).sum(axis=1))
-        self.simulation.step(q, active)
-        self.state = self.simulation.state()
+        self.state = self.simulation.step(q, active, self._late)
         self.step += 1
         for outcome, where in _terminations(self._protocol, self.state):
             self.ended[active & where] = outcome
             active &= ~where
         if active.any():
-            time = self.step * self._protocol.control_period  # [s]
-            self.observation = self.sensors.observe(self.step, time, self.state, active)
+            self._see()
+
+    def _see(self) -> None:
+        """Take the measurements of the present control step."""
+        measured, self.odometry = (
+            late.seen() if self.step else late.start(self.state) for late in self._late
+        )
+        time = self.step * self._protocol.control_period  # [s]
+        self.observation = self.sensors.observe(self.step, time, self.state, self.active, measured)
 
 
 def _terminations(protocol: EvalProtocol, state: State) -> list[tuple[Outcome, NDArray[np.bool_]]]:

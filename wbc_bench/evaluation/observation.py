@@ -16,8 +16,9 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.simulation import State
 from wbc_bench.randomness import stream
-from wbc_bench.robot import NUM_JOINTS
-from wbc_bench.rotations import matrix_from_wxyz, rho6
+from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
+from wbc_bench.robot.kinematics import ArmKinematics
+from wbc_bench.rotations import matrix_from_rotvec, matrix_from_wxyz, rho6
 
 Array = NDArray[np.float64]
 _WIDTHS = {  # signals with noise, in the order of their columns
@@ -57,29 +58,54 @@ class Sensors:
                 ],
                 axis=1,
             )  # (T + 1, N, columns)
+        # the IMU's axes in the base, and what it measures along them
+        self._imu_tilt = None
+        if rows.imu_tilt.any():
+            self._imu_tilt = matrix_from_rotvec(np.pad(rows.imu_tilt, ((0, 0), (0, 1))))
+        self._arm = ArmKinematics(load_robot(protocol.robot)) if rows.joint_offset.any() else None
+        self._drift = None
+        if rows.odometry_drift.any():
+            self._drift = _random_walks(protocol, rows)
         self._target_rot_w = matrix_from_wxyz(rows.target_quat_w)
         self._period = protocol.control_period
         self._before: State | None = None
 
-    def observe(self, step: int, time: float, state: State, active: NDArray[np.bool_]) -> Observation:
-        """The observation at control step `step`, time [s]."""
+    def observe(
+        self,
+        step: int,
+        time: float,
+        state: State,
+        active: NDArray[np.bool_],
+        measured: State | None = None,
+    ) -> Observation:
+        """The observation at control step `step`, time [s].
+
+        `measured` is the state that the sensors saw last, the present one if None.
+        """
+        measured = measured or state
 
         def noisy(name: str, value: Array) -> Array:
             return value if self._noise is None else value + self._noise[step][:, self._columns[name]]
 
         rot_w, rows, signals = state.base_rot_w, self._rows, self._signals
         proprioception = ee_pose = base_pose = privileged = None
+        encoders = measured.joint_pos + rows.joint_offset
         if "proprioception" in signals:
             proprioception = Proprioception(
-                base_ang_vel_b=noisy("base_ang_vel", state.base_ang_vel_b),
-                gravity_b=noisy("gravity", -rot_w[:, 2]),  # R^T (0, 0, -1)
-                joint_pos=noisy("joint_pos", state.joint_pos),
-                joint_vel=noisy("joint_vel", state.joint_vel),
-                joint_torque=noisy("joint_torque", state.joint_torque),
+                base_ang_vel_b=noisy("base_ang_vel", self._by_imu(measured.base_ang_vel_b)),
+                # R^T (0, 0, -1)
+                gravity_b=noisy("gravity", self._by_imu(-measured.base_rot_w[:, 2])),
+                joint_pos=noisy("joint_pos", encoders),
+                joint_vel=noisy("joint_vel", measured.joint_vel),
+                joint_torque=noisy("joint_torque", measured.joint_torque),
             )
         if "ee_pose" in signals:
-            pos_b = np.einsum("nji,nj->ni", rot_w, state.ee_pos_w - state.base_pos_w)
-            rot_b = np.swapaxes(rot_w, 1, 2) @ state.ee_rot_w
+            if self._arm is None:
+                base = measured.base_rot_w
+                pos_b = np.einsum("nji,nj->ni", base, measured.ee_pos_w - measured.base_pos_w)
+                rot_b = np.swapaxes(base, 1, 2) @ measured.ee_rot_w
+            else:  # where the encoders say that the hand is
+                pos_b, rot_b = self._arm.pose(encoders[:, NUM_LEG_JOINTS:])
             ee_pose = EePose(noisy("ee_pos", pos_b), noisy("ee_rot", rho6(rot_b)))
         if "base_pose" in signals:
             base_pose = BasePose(state.base_pos_w, rot_w, state.base_lin_vel_w)
@@ -110,13 +136,29 @@ class Sensors:
         joint_acc = (state.joint_vel - before.joint_vel) * rate
         return {"joint_acc": joint_acc, "ee_lin_vel_b": lin_b, "ee_ang_vel_b": ang_b}
 
-    def target(self, state: State) -> Target:
-        """The target of each episode in its instantaneous base frame."""
-        return target_in_base(state, self._rows.target_pos_w, self._target_rot_w)
+    def _by_imu(self, vector_b: Array) -> Array:
+        """Vectors (N, 3) of the base frame along the axes of the IMU, tilted and not known to be."""
+        return vector_b if self._imu_tilt is None else np.einsum("nji,nj->ni", self._imu_tilt, vector_b)
+
+    def target(self, odometry: State, step: int = 0) -> Target:
+        """The manifest's targets in the base frame that odometry gives at control step `step`."""
+        return self.in_base(odometry, self._rows.target_pos_w, self._target_rot_w, step)
+
+    def in_base(self, odometry: State, pos_w: Array, rot_w: Array, step: int = 0) -> Target:
+        """Poses (N, 3) [m], (N, 3, 3) of the world in the base frame that odometry gives, drift included."""
+        base = odometry.base_rot_w
+        believed = odometry.base_pos_w
+        if self._drift is not None:
+            believed = believed + self._drift[step]
+        pos_b = np.einsum("nji,nj->ni", base, pos_w - believed)
+        return Target(pos_b, np.swapaxes(base, 1, 2) @ rot_w)
 
 
-def target_in_base(state: State, pos_w: Array, rot_w: Array) -> Target:
-    """Poses (N, 3), (N, 3, 3) in the world as each base sees them."""
-    base = state.base_rot_w
-    pos_b = np.einsum("nji,nj->ni", base, pos_w - state.base_pos_w)
-    return Target(pos_b, np.swapaxes(base, 1, 2) @ rot_w)
+def _random_walks(protocol: EvalProtocol, rows: EpisodeManifest) -> Array:
+    """(T + 1, N, 3) [m] drift of the odometry at every control step, zero at the start."""
+    root, shape = np.sqrt(protocol.control_period), (protocol.num_steps, 3)
+    steps = [
+        stream(int(key), "odometry").normal(0.0, drift * root, shape)
+        for key, drift in zip(rows.noise_key, rows.odometry_drift, strict=True)
+    ]
+    return np.pad(np.stack(steps, axis=1).cumsum(axis=0), ((1, 0), (0, 0), (0, 0)))

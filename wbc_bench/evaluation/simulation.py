@@ -1,5 +1,7 @@
 """A shard of episodes on MuJoCo's batch API: reset from manifest rows, push, step, and measure."""
 
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import mujoco
@@ -9,8 +11,10 @@ from numpy.typing import NDArray
 
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Scene, load_robot
-from wbc_bench.rotations import matrix_from_wxyz
+from wbc_bench.episodes.world import PAYLOAD, world_model
+from wbc_bench.evaluation.delays import LateCommands, LateStates, physics_steps
+from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, Scene, load_robot
+from wbc_bench.rotations import matrix_from_rotvec, matrix_from_wxyz, wxyz_from_matrix
 
 Array = NDArray[np.float64]
 _JOINTS = slice(7, 7 + NUM_JOINTS)  # of the robot in qpos; what a scene adds follows
@@ -64,18 +68,34 @@ class State(NamedTuple):
     diverged: NDArray[np.bool_]  # (N,)
 
 
+def scale_gains(robot: Robot, fields: Callable[[str], Array], kp: Array, kd: Array) -> None:
+    """Multiply the gains of PD loops by factors (N, 14); `fields(name)` is a model field of N simulations."""
+    gain = fields("actuator_gainprm")
+    if robot.facts.variant.motor is None:
+        gain[:, :, 0] *= kp
+        bias = fields("actuator_biasprm")
+        bias[:, :, 1] *= kp
+        bias[:, :, 2] *= kd
+    else:  # the controller inside of MuJoCo's motor
+        gain[:, :, 4] *= kp
+        gain[:, :, 6] *= kd
+
+
 class Simulation:
     """N episodes of one protocol, on one thread. Rows that have ended are not stepped further."""
 
     def __init__(self, protocol: EvalProtocol, rows: EpisodeManifest, scene: Scene | None = None) -> None:
         self.protocol, self.rows = protocol, rows
         self.robot = load_robot(protocol.robot)
-        model = self.robot.model(protocol.physics.timestep, scene)
+        model = world_model(protocol, scene)
         count = len(rows)
         # persistent: sensors refreshed after a step are not computed again by the next
         self._batch = batch = Batch(model, count, nthread=1, persistent=True)
         self._base = model.body(self.robot.facts.base).id
         self._randomise(model)
+        physics = protocol.physics
+        delay = physics_steps(rows.command_delay, physics.timestep)
+        self._commands = LateCommands(delay, physics.decimation, self.robot.default_q)
         self._qpos, self._qvel, self._ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
         self._subtree_com = batch.bind("subtree_com")
@@ -84,20 +104,32 @@ class Simulation:
         self._reset()
 
     def _randomise(self, model: mujoco.MjModel) -> None:
-        """Friction, base mass and gains of each episode become model fields of its simulation."""
+        """What an episode draws of the robot and of its ground becomes model fields of its simulation."""
         rows, batch = self.rows, self._batch
         # the larger coefficient of a pair counts, so both sides carry the draw
         batch.expand("geom_friction")[:, :, 0] = rows.friction[:, None]
         base = self._base
         mass = model.body_mass[base]
-        batch.expand("body_mass")[:, base] = mass + rows.base_mass
+        masses = batch.expand("body_mass")
+        masses[:, base] = mass + rows.base_mass
         batch.expand("body_inertia")[:, base] = (
             model.body_inertia[base] * ((mass + rows.base_mass) / mass)[:, None]
         )
-        batch.expand("actuator_gainprm")[:, :, 0] *= rows.kp_scale
-        bias = batch.expand("actuator_biasprm")
-        bias[:, :, 1] *= rows.kp_scale
-        bias[:, :, 2] *= rows.kd_scale
+        scale_gains(self.robot, batch.expand, rows.kp_scale, rows.kd_scale)
+        if np.any(rows.motor_strength != 1):
+            batch.expand("actuator_forcerange")[:] *= rows.motor_strength[:, None, None]
+        if rows.payload.any():
+            hand = model.body(PAYLOAD).id
+            masses[:, hand] = rows.payload
+            batch.expand("body_ipos")[:, hand] = rows.payload_offset
+        ground = model.geom("ground").id
+        if rows.slope.any():
+            turned = np.pad(rows.slope, ((0, 0), (0, 1)))
+            batch.expand("geom_quat")[:, ground] = wxyz_from_matrix(matrix_from_rotvec(turned))
+        if rows.terrain_offset.any():
+            place = np.pad(rows.terrain_offset, ((0, 0), (0, 1)))
+            turned = matrix_from_rotvec(np.pad(rows.slope, ((0, 0), (0, 1))))
+            batch.expand("geom_pos")[:, ground] = np.einsum("nij,nj->ni", turned, place)
         batch.set_const()
 
     def _reset(self) -> None:
@@ -109,20 +141,40 @@ class Simulation:
         qpos[:, 7 : 7 + NUM_LEG_JOINTS] += rows.leg_q
         qvel[:, :6] = rows.base_vel
         qvel[:, 6 : 6 + NUM_LEG_JOINTS] = rows.leg_qd
-        self._ctrl[:] = self.robot.default_q
+        self._ctrl[:] = self.robot.default_q - rows.joint_offset
         self._batch.forward()
 
-    def push(self, velocity_w: Array) -> None:
-        """Add (N, 2) [m/s] to the base's horizontal velocity in the world."""
-        self._qvel[:, :2] += velocity_w
+    def push(self, velocity: Array) -> None:
+        """Add to the base's velocity: (N, 2), (N, 3) in the world [m/s], or (N, 6), the rest in the base."""
+        self._qvel[:, : velocity.shape[1]] += velocity
 
-    def step(self, command: Array, active: NDArray[np.bool_]) -> None:
-        """Let the PD loop track joint commands (N, 14) [rad] for one control period, in active rows only."""
+    def step(self, command: Array, active: NDArray[np.bool_], late: Sequence[LateStates] = ()) -> State:
+        """Let the PD loop track joint commands (N, 14) [rad] for one control period, in active rows only.
+
+        Commands act when their episode's delay has passed; the PD loop compares them with the encoders, which
+        are off by the episode's offset. `late` are shown the states at the times that they ask for.
+
+        Returns:
+            The state at the end of the period.
+        """
+        decimation = self.protocol.physics.decimation
         ids = np.flatnonzero(active)
-        self._ctrl[ids] = command[ids]
-        self._batch.step(
-            None if len(ids) == len(active) else ids, nstep=self.protocol.physics.decimation, stage=_STAGE_VEL
-        )
+        chosen = None if len(ids) == len(active) else ids
+        self._commands.give(command)
+        for states in late:
+            states.begin_step()
+        sampled = set().union(*(states.offsets for states in late)) - {decimation}
+        for begin, end in pairwise(sorted({0, decimation} | self._commands.offsets | sampled)):
+            self._ctrl[ids] = (self._commands.acting(begin) - self.rows.joint_offset)[ids]
+            stage = _STAGE_VEL if end in sampled | {decimation} else _STAGE_NONE
+            self._batch.step(chosen, nstep=end - begin, stage=stage)
+            if end in sampled:
+                for states in late:
+                    states.sample(end, self.state())
+        state = self.state()
+        for states in late:
+            states.sample(decimation, state)
+        return state
 
     @property
     def qpos(self) -> Array:

@@ -15,7 +15,6 @@ from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.single import CONDITIONS, UNSCRIPTED, _protocol, _row, episode_of
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
-from wbc_bench.evaluation.observation import target_in_base
 from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
@@ -82,7 +81,7 @@ def follow(
         if furnished:
             furnished.look(scenery)
         pos_w, rot_w = to_world(source.target(step * period, seen), seen)
-        target = target_in_base(loop.state, pos_w[None], rot_w[None])
+        target = loop.target(pos_w[None], rot_w[None])
         if step == 0:
             loop.reset(target)
         if not loop.advance(target).stepped.any():

@@ -1,13 +1,24 @@
 """The robot: facts in one file, and the MuJoCo model and URDF that are built from it."""
 
+import hashlib
 from dataclasses import dataclass
 from functools import cache
 
+import msgspec
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.robot.facts import Facts, RobotConfig, effort_of, gain_of, load_facts, mount_of, tcp_of
+from wbc_bench.robot.facts import (
+    Facts,
+    RobotConfig,
+    effort_of,
+    gain_of,
+    load_facts,
+    mount_of,
+    tcp_of,
+    without_sources,
+)
 from wbc_bench.robot.mjcf import build_model, build_spec
 from wbc_bench.robot.scene import Scene
 from wbc_bench.robot.urdf import build_urdf
@@ -27,6 +38,7 @@ __all__ = [
     "load_robot",
     "mount_of",
     "tcp_of",
+    "without_sources",
 ]
 
 JOINT_NAMES = tuple(joint.name for joint in load_facts().joints)  # legs L, R from abad to ankle, then J1..J6
@@ -50,6 +62,18 @@ class Robot:
     kd: NDArray[np.float64]  # (14,) [N m s/rad]
     armature: NDArray[np.float64]  # (14,) [kg m^2]
 
+    @property
+    def digest(self) -> str:
+        """SHA-256 over everything the robot is built of, whatever named it; remarks on sources aside."""
+        facts = self.facts
+        built = [facts.base, facts.nominal_base_height, facts.fixed, facts.foot, facts.friction, facts.frames]
+        built += [facts.links, facts.joints, facts.variant.motor, facts.variant.joint_friction]
+        built += [mount_of(facts, self.config), tcp_of(facts, self.config)]
+        built += [self.default_q.tolist(), self.action_scale.tolist()]
+        built += [self.kp.tolist(), self.kd.tolist(), self.effort.tolist()]
+        text = msgspec.json.encode(without_sources(msgspec.to_builtins(built)), order="deterministic")
+        return hashlib.sha256(text).hexdigest()
+
     def model(self, timestep: float = 0.002, scene: Scene | None = None) -> mujoco.MjModel:
         """The MuJoCo model, in a scene if one is given."""
         return build_model(self.facts, self.config, timestep, scene)
@@ -72,9 +96,9 @@ def load_robot(config: RobotConfig = RobotConfig()) -> Robot:  # noqa: B008  (fr
     """The robot of a configuration.
 
     Raises:
-        UnknownNameError: a mount or end-effector that the facts do not have.
+        UnknownNameError: a variant, mount or end-effector that the facts do not have.
     """
-    facts = load_facts()
+    facts = load_facts(config.variant)
     mount_of(facts, config)
     tcp_of(facts, config)
     joints = facts.joints

@@ -2,7 +2,7 @@
 
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
@@ -11,6 +11,7 @@ from wbc_bench.errors import ProtocolError, UnknownNameError
 Vec3 = tuple[float, float, float]
 Gain = tuple[float, float]  # (kp [N m/rad], kd [N m s/rad])
 FACTS_FILE = Path(__file__).with_name("tron1_l5.toml")
+DEFAULT_VARIANT = "limx_adapter"  # of the first protocols, which name none
 
 
 class _Block(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -56,8 +57,11 @@ class Joint(_Block, frozen=True):
 
 
 class Frame(_Block, frozen=True):
+    """A frame at `xyz` [m] in its link, turned by `rpy` [rad] about fixed axes."""
+
     link: str
     xyz: Vec3
+    rpy: Vec3 = (0.0, 0.0, 0.0)
 
 
 class Mount(_Block, frozen=True):
@@ -67,9 +71,18 @@ class Mount(_Block, frozen=True):
     lumps: tuple[Link, ...] = ()
 
 
+class Tool(_Block, frozen=True):
+    """A tool frame that is turned: `xyz` [m] and `rpy` [rad] in the last link."""
+
+    xyz: Vec3
+    rpy: Vec3
+
+
 class Tcp(_Block, frozen=True):
+    """Tool frames by name; one that is parallel to its link is its origin [m] alone."""
+
     link: str
-    variants: dict[str, Vec3]
+    variants: dict[str, Vec3 | Tool]
 
 
 class Foot(_Block, frozen=True):
@@ -96,8 +109,32 @@ class ActionScale(_Block, frozen=True):
     arm: tuple[float, float, float, float, float, float]
 
 
+class Motor(_Block, frozen=True):
+    """Speed-torque curve of every motor: what is left of its torque falls to zero at the joint's speed limit.
+
+    `stall` is the torque that the curve has at rest over the joint's torque limit: with 2 the whole limit is
+    there up to half the speed limit.
+    """
+
+    stall: float
+
+
+class Variant(_Block, frozen=True):
+    """What one build of the robot has other than the rest of the file; links and joints replace by name."""
+
+    description: str
+    mount: str = ""
+    tcp: str = ""
+    default_qpos: dict[str, float] | None = None
+    gains: Gains | None = None
+    motor: Motor | None = None
+    joint_friction: bool = False  # the joints' `frictionloss` acts
+    links: tuple[Link, ...] = ()
+    joints: tuple[Joint, ...] = ()
+
+
 class Facts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole facts file."""
+    """The whole facts file; after `load_facts` links, joints, gains and defaults are those of one variant."""
 
     name: str
     base: str
@@ -115,11 +152,16 @@ class Facts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mounts: dict[str, Mount]
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
+    variants: dict[str, Variant]
+    variant: Variant = Variant(description="")  # the one that was chosen
 
 
 class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a protocol may change of the robot; empty strings and None mean the default of the facts file."""
+    """What a protocol may change of the robot; empty strings and None mean the variant's own."""
 
+    LATER: ClassVar[frozenset[str]] = frozenset({"variant"})  # see `schema.meaning_digest`
+
+    variant: str = DEFAULT_VARIANT
     mount: str = ""
     tcp: str = ""
     ankle_effort: float | None = None  # [N m] 20 in the vendor's files, 40 or 80 in other public ones
@@ -129,16 +171,31 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @cache
-def load_facts(path: Path = FACTS_FILE) -> Facts:
-    """The decoded facts file.
+def load_facts(variant: str = DEFAULT_VARIANT, path: Path = FACTS_FILE) -> Facts:
+    """The facts of one variant of the robot.
 
     Raises:
         ProtocolError: the file cannot be read or a field is wrong (its path is named).
+        UnknownNameError: the file has no such variant.
     """
     try:
-        return msgspec.toml.decode(path.read_bytes(), type=Facts)
+        facts = msgspec.toml.decode(path.read_bytes(), type=Facts)
     except (OSError, msgspec.DecodeError) as error:
         raise ProtocolError(f"robot facts {path}: {error}") from error
+    if variant not in facts.variants:
+        raise UnknownNameError("robot variant", variant, facts.variants, "robot.variant")
+    chosen = facts.variants[variant]
+    links, joints = ({item.name: item for item in items} for items in (chosen.links, chosen.joints))
+    return msgspec.structs.replace(
+        facts,
+        default_mount=chosen.mount or facts.default_mount,
+        default_tcp=chosen.tcp or facts.default_tcp,
+        default_qpos=facts.default_qpos if chosen.default_qpos is None else chosen.default_qpos,
+        gains=chosen.gains or facts.gains,
+        links=tuple(links.get(link.name, link) for link in facts.links),
+        joints=tuple(joints.get(joint.name, joint) for joint in facts.joints),
+        variant=chosen,
+    )
 
 
 def mount_of(facts: Facts, config: RobotConfig) -> Mount:
@@ -154,7 +211,10 @@ def tcp_of(facts: Facts, config: RobotConfig) -> Frame:
     name = config.tcp or facts.default_tcp
     if name not in facts.tcp.variants:
         raise UnknownNameError("tcp", name, facts.tcp.variants, "robot.tcp")
-    return Frame(link=facts.tcp.link, xyz=facts.tcp.variants[name])
+    tool = facts.tcp.variants[name]
+    if isinstance(tool, Tool):
+        return Frame(link=facts.tcp.link, xyz=tool.xyz, rpy=tool.rpy)
+    return Frame(link=facts.tcp.link, xyz=tool)
 
 
 def effort_of(joint: Joint, config: RobotConfig) -> float:
@@ -171,3 +231,12 @@ def gain_of(facts: Facts, joint: Joint, config: RobotConfig) -> Gain:
     if joint.name.startswith("ankle"):
         return config.ankle_gain or facts.gains.ankle
     return config.leg_gain or facts.gains.leg
+
+
+def without_sources(value: Any) -> Any:
+    """Facts in the types of JSON, without the remarks on where they come from."""
+    if isinstance(value, dict):
+        return {key: without_sources(item) for key, item in value.items() if key != "src"}
+    if isinstance(value, list | tuple):
+        return [without_sources(item) for item in value]
+    return value

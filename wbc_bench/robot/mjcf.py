@@ -3,7 +3,18 @@
 import mujoco
 import numpy as np
 
-from wbc_bench.robot.facts import Facts, Geom, Link, RobotConfig, effort_of, gain_of, mount_of, tcp_of
+from wbc_bench.robot.facts import (
+    Facts,
+    Geom,
+    Joint,
+    Link,
+    RobotConfig,
+    Vec3,
+    effort_of,
+    gain_of,
+    mount_of,
+    tcp_of,
+)
 from wbc_bench.robot.scene import Scene
 
 GROUND = 1  # collision bits: what may touch the ground,
@@ -47,7 +58,7 @@ def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mu
         size=[0, 0, 0.05],
         contype=GROUND,
         conaffinity=GROUND,
-        friction=[facts.friction.slide, 0.005, 0.0001],
+        friction=_friction(facts),
         material="ground",
     )
     links = {link.name: link for link in facts.links}
@@ -72,17 +83,10 @@ def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mu
             axis=joint.axis,
             range=joint.range,
             armature=joint.armature,
-            damping=[joint.damping, 0, 0],  # frictionloss (0.01 N m, ankles) would add a solver row
+            damping=[joint.damping, 0, 0],
+            frictionloss=joint.frictionloss if facts.variant.joint_friction else 0.0,
         )
-        kp, kd = gain_of(facts, joint, config)
-        effort = effort_of(joint, config)
-        actuator = spec.add_actuator(
-            name=joint.name,
-            target=joint.name,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            forcerange=[-effort, effort],
-        )
-        actuator.set_to_position(kp=kp, kv=kd)
+        _add_motor(spec, facts, joint, config)
 
     for name, xyz in fixed.items():
         _add_link(base, links[name], xyz)
@@ -92,7 +96,7 @@ def build_spec(facts: Facts, config: RobotConfig, timestep: float = 0.002) -> mu
     for name, frame in facts.frames.items():
         bodies[frame.link].add_site(name=name, pos=frame.xyz, size=[0.01, 0.01, 0.01])
     tcp = tcp_of(facts, config)
-    bodies[tcp.link].add_site(name="tcp", pos=tcp.xyz, size=[0.01, 0.01, 0.01])
+    bodies[tcp.link].add_site(name="tcp", pos=tcp.xyz, quat=_quat(tcp.rpy), size=[0.01, 0.01, 0.01])
 
     _exclude_neighbours(spec, facts)
     _add_sensors(spec)
@@ -145,6 +149,37 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "ground"
 
 
+def _add_motor(spec: mujoco.MjSpec, facts: Facts, joint: Joint, config: RobotConfig) -> None:
+    """A PD position loop within the torque limit and, if the variant has one, the speed-torque curve.
+
+    With a controller that clamps its voltage MuJoCo's motor cancels its own back-EMF: with PD torque u,
+    torque limit e, speed limit w and stall torque s e it exerts
+    clip(clip(u, -s e (1 + qd/w), s e (1 - qd/w)), -e, e).
+    Source: MuJoCo 4.0.0 `dcmotor`, measured in tests/robot/test_motor.py.
+    """
+    kp, kd = gain_of(facts, joint, config)
+    effort = effort_of(joint, config)
+    actuator = spec.add_actuator(
+        name=joint.name,
+        target=joint.name,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        forcerange=[-effort, effort],
+    )
+    motor = facts.variant.motor
+    if motor is None:
+        actuator.set_to_position(kp=kp, kv=kd)
+        return
+    volt = 1.0  # of the supply; torques and speeds do not depend on it
+    actuator.set_to_dcmotor(
+        motorconst=[0, 0],
+        resistance=0,
+        nominal=[volt, motor.stall * effort, joint.velocity],
+        saturation=[effort, 0, 0],
+        controller=[kp, 0, kd, 0, 0, volt],
+        ctrlspec=mujoco.mjtCtrlInput.mjINPUT_POS,
+    )
+
+
 def _add_link(parent, link: Link, xyz: tuple[float, float, float]):
     body = parent.add_body(name=link.name, pos=xyz)
     body.mass, body.ipos, body.fullinertia = link.mass, link.com, link.inertia
@@ -170,10 +205,19 @@ def _add_geom(body, geom: Geom) -> None:
         mass=0,
         rgba=_COLOURS.get(geom.name.split("_")[0], _COLOURS[""]),
     )
-    # URDF's fixed-axis roll, pitch, yaw
+    added.quat = _quat(geom.rpy)
+
+
+def _friction(facts: Facts) -> list[float]:
+    """Sliding, torsional and rolling friction; the last two are MuJoCo's defaults and do not act here."""
+    return [facts.friction.slide, 0.005, 0.0001]
+
+
+def _quat(rpy: Vec3) -> np.ndarray:
+    """Quaternion wxyz (4,) of URDF's roll, pitch and yaw [rad] about fixed axes."""
     quat = np.zeros(4)
-    mujoco.mju_euler2Quat(quat, np.array(geom.rpy), "XYZ")
-    added.quat = quat
+    mujoco.mju_euler2Quat(quat, np.array(rpy), "XYZ")
+    return quat
 
 
 def _add_foot(body, facts: Facts, side: str) -> None:
@@ -188,6 +232,7 @@ def _add_foot(body, facts: Facts, side: str) -> None:
             contype=GROUND,
             conaffinity=GROUND,
             mass=0,
+            friction=_friction(facts),  # of two surfaces that touch the larger coefficient counts
             rgba=_COLOURS["foot"],
         )
     height = 0.03  # [m] of the shoe above the sole

@@ -17,9 +17,11 @@ def build_urdf(facts: Facts, config: RobotConfig) -> str:
     for lump in mount.lumps:
         _add_link(robot, lump)
         _add_joint(robot, f"{lump.name}_fixed", facts.base, lump.name, (0.0, 0.0, 0.0))
-    for name, xyz in (dict(facts.fixed) | {"arm_base": mount.xyz}).items():
-        _add_joint(robot, f"{name}_fixed", facts.base, name, xyz)
+    fixed = dict(facts.fixed) | {"arm_base": mount.xyz}
     for joint in facts.joints:
+        # at its first joint, as in the MuJoCo model: readers that go by the order of the file agree on it
+        if joint.parent in fixed:
+            _add_joint(robot, f"{joint.parent}_fixed", facts.base, joint.parent, fixed.pop(joint.parent))
         element = _add_joint(robot, joint.name, joint.parent, joint.child, joint.xyz, kind="revolute")
         ET.SubElement(element, "axis", xyz=_text(joint.axis))
         lower, upper = joint.range
@@ -31,11 +33,14 @@ def build_urdf(facts: Facts, config: RobotConfig) -> str:
             effort=repr(effort_of(joint, config)),
             velocity=repr(joint.velocity),
         )
-        ET.SubElement(element, "dynamics", damping=repr(joint.damping), friction="0.0")
+        friction = joint.frictionloss if facts.variant.joint_friction else 0.0
+        ET.SubElement(element, "dynamics", damping=repr(joint.damping), friction=repr(friction))
+    for name, xyz in fixed.items():
+        _add_joint(robot, f"{name}_fixed", facts.base, name, xyz)
     frames: dict[str, Frame] = dict(facts.frames) | {"tcp": tcp_of(facts, config)}
     for name, frame in frames.items():
         ET.SubElement(robot, "link", name=name)
-        _add_joint(robot, f"{name}_frame", frame.link, name, frame.xyz)
+        _add_joint(robot, f"{name}_frame", frame.link, name, frame.xyz, frame.rpy)
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
@@ -44,9 +49,9 @@ def _text(values) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _add_joint(robot, name: str, parent: str, child: str, xyz, kind: str = "fixed"):
+def _add_joint(robot, name: str, parent: str, child: str, xyz, rpy=(0, 0, 0), kind: str = "fixed"):
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    ET.SubElement(joint, "origin", xyz=_text(xyz), rpy="0 0 0")
+    ET.SubElement(joint, "origin", xyz=_text(xyz), rpy=_text(rpy))
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
     return joint

@@ -7,7 +7,6 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError
 from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
-from wbc_bench.evaluation.observation import target_in_base
 from wbc_bench.evaluation.tracking import outcome_of, seen_of
 from wbc_bench.registry import load_controller
 from wbc_bench.results.tracking import Series, Tracked
@@ -129,7 +128,7 @@ class Session:
         self.moment: Moment = moment_of(self._loop, 0, self._pos_w, self._rot_w, push)
 
     def _target(self) -> Target:
-        return target_in_base(self._loop.state, self._pos_w[None], self._rot_w[None])
+        return self._loop.target(self._pos_w[None], self._rot_w[None])
 
     def _load(self, name: str) -> Source:
         return load_source(name, protocol=self.protocol)

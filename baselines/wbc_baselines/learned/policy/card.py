@@ -16,7 +16,8 @@ from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench import provenance
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, UnknownNameError
-from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of
+from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of, without_sources
+from wbc_bench.schema import meaning
 
 FORMAT = 2
 Numbers = tuple[float, ...]
@@ -86,7 +87,10 @@ def robot_facts(robot: Robot, control_period: float) -> RobotFacts:
     facts, tcp = robot.facts, tcp_of(robot.facts, robot.config)
     mount = mount_of(facts, robot.config)
     bodies = [facts.base, facts.fixed, facts.foot, facts.links, facts.joints, mount.lumps]
-    built = msgspec.json.encode(_unsourced(msgspec.to_builtins(bodies)), order="deterministic")
+    later = [facts.variant.motor, facts.variant.joint_friction, tcp.rpy]
+    if later != [None, False, (0.0, 0.0, 0.0)]:  # cards from before these facts keep their digest
+        bodies += later
+    built = msgspec.json.encode(without_sources(msgspec.to_builtins(bodies)), order="deterministic")
     return RobotFacts(
         joints=JOINT_NAMES,
         **{
@@ -108,7 +112,7 @@ def conditions(protocol: EvalProtocol) -> dict[str, Any]:
     Properties that no policy can notice are left out (names, counts, seed, the rule of success), as are those
     in `RobotFacts`, and the physics step, which is longer in training than in any evaluation.
     """
-    sections = msgspec.to_builtins(protocol)
+    sections = meaning(protocol)
     for name in ("name", "description", "success", "robot", "physics"):
         del sections[name]
     sections["episodes"] = {"horizon": sections["episodes"]["horizon"]}
@@ -282,12 +286,3 @@ def _short(value: Any) -> str:
 
 def _digest(facts: RobotFacts) -> str:
     return hashlib.sha256(msgspec.json.encode(facts)).hexdigest()
-
-
-def _unsourced(value):
-    """Without the remarks on where a fact comes from."""
-    if isinstance(value, dict):
-        return {key: _unsourced(item) for key, item in value.items() if key != "src"}
-    if isinstance(value, list | tuple):
-        return [_unsourced(item) for item in value]
-    return value

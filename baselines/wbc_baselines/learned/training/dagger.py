@@ -33,7 +33,7 @@ from wbc_bench.controller import (
     ProtocolAware,
     Target,
 )
-from wbc_bench.episodes.manifest import EpisodeManifest
+from wbc_bench.episodes.manifest import EpisodeManifest, neutral
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.outcomes import STRATA
@@ -220,6 +220,7 @@ def sample_manifest(
     pos = target_set.pos_w[chosen].astype(np.float64)
     none, number = np.full(count, "", dtype=object), np.arange(count)
     return EpisodeManifest(
+        **neutral(count),
         replicate=np.zeros(count, np.int64),
         episode=number,
         stratum=np.array([STRATA[k] for k in target_set.stratum[chosen]], dtype=object),

@@ -18,10 +18,13 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from wbc_baselines.learned.packaged import TARGET_SETS
+from wbc_bench.episodes.manifest import check_robot
 from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
 from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.outcomes import STRATA
+from wbc_bench.robot import load_robot
+from wbc_bench.schema import meaning
 
 SEED_OFFSET = 2**62  # added to the protocol's seed, so that no evaluation uses the same random stream
 CHUNK = 30  # targets per task, about a second of work
@@ -45,7 +48,8 @@ class TargetSet(NamedTuple):
 
 def digest(protocol: EvalProtocol) -> str:
     """Return the SHA-256 of the parts of a protocol that targets depend on: ranges, robot, limits, seed."""
-    parts = [protocol.targets, protocol.robot, protocol.termination, protocol.episodes.seed]
+    sections = (protocol.targets, protocol.robot, protocol.termination)
+    parts = [*map(meaning, sections), protocol.episodes.seed]
     return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()
 
 
@@ -100,7 +104,10 @@ def write_target_set(target_set: TargetSet, protocol: EvalProtocol, path: Path) 
     for values in target_set[1:]:
         columns.append(pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1]))
     table = pa.Table.from_arrays(columns, names=list(TargetSet._fields))
-    table = table.replace_schema_metadata({"protocol": protocol.name, "digest": digest(protocol)})
+    robot = load_robot(protocol.robot).digest
+    table = table.replace_schema_metadata(
+        {"protocol": protocol.name, "digest": digest(protocol), "robot_digest": robot}
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     fresh = path.with_name(f".{path.name}.part")
     pq.write_table(table, fresh, compression="zstd", use_dictionary=False)
@@ -141,6 +148,7 @@ def read_target_set(protocol: EvalProtocol, path: Path | None = None) -> TargetS
             f"target set '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
             f"{protocol.name} has {digest(protocol)[:16]}...: draw it again with `wbc-train targets`"
         )
+    check_robot(table, protocol, f"target set '{path}'", "draw it again with `wbc-train targets`")
 
     def matrix(name: str) -> NDArray[np.float32]:
         column = table[name].combine_chunks()
