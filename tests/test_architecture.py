@@ -19,8 +19,8 @@ LAYERS = (
     ("sources",),
     ("controller",),
     ("episodes",),
-    ("robot", "results"),
-    ("provenance", "progress", "outcomes", "files", "schema"),
+    ("robot", "results", "tensors"),
+    ("provenance", "progress", "outcomes", "files", "readers", "schema"),
     ("rotations", "randomness", "errors"),
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")

@@ -13,8 +13,9 @@ import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
+from wbc_bench.readers import read_toml
 from wbc_bench.robot import RobotConfig, load_facts
-from wbc_bench.schema import meaning_digest, read_toml
+from wbc_bench.schema import meaning_digest
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]

@@ -3,7 +3,7 @@
 <root>/doors/<source>/<controller>/<condition>_<seed>/run.json, episodes.parquet
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from wbc_bench.outcomes import TERMINATED
 from wbc_bench.results import stats
 from wbc_bench.results.formatting import DEG, names_note, number_text
-from wbc_bench.results.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.results.records import driven_folder, parquet_of, read_record, refuse_values, write_record
 from wbc_bench.results.table import Table
 from wbc_bench.results.tracking import STOOD
 
@@ -83,8 +84,29 @@ def read_doors(root: Path) -> list[DoorRun]:
 
 def _read(path: Path) -> DoorRun:
     beside = path.with_name("episodes.parquet")
-    record, episodes = read_record(path, DoorRecord, beside, "episodes_sha256")
-    return DoorRun(record, episodes.to_pandas())
+    record, table = read_record(path, DoorRecord, beside, "episodes_sha256", COLUMNS)
+    run = DoorRun(record, table.to_pandas())
+    refuse_values(path, _mistakes(run))
+    return run
+
+
+def _mistakes(run: DoorRun) -> Iterator[tuple[str, object, str]]:
+    """(field, value, what is valid) of what the data beside a record contradict."""
+    record, episodes = run
+    if record.completed != len(episodes):
+        yield "completed", record.completed, f"{len(episodes)}, the rows beside it"
+    if not 0 < record.completed <= record.requested:
+        yield "completed", record.completed, f"1 to {record.requested}, as many as requested"
+    if record.successes != int(np.asarray(episodes["success"]).sum()):
+        yield "successes", record.successes, "as many as the rows beside it"
+    for name in set(episodes["outcome"]) - {STOOD, *map(str, TERMINATED)}:
+        yield "outcome", f"'{name}'", ", ".join((STOOD, *map(str, TERMINATED)))
+
+
+COLUMNS = {
+    **dict.fromkeys(("x", "y", "z", "yaw", "angle", "final_angle", "first_closed"), "double"),
+    **{"outcome": "string", "steps": "int64", "success": "bool"},
+}
 
 
 def door_table(runs: list[DoorRun], labels: Mapping[str, str] | None = None) -> Table:

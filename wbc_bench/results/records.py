@@ -1,6 +1,7 @@
 """A run as two files: its data as parquet, and a JSON record of what was run."""
 
 import hashlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -10,6 +11,7 @@ import pyarrow.parquet as pq
 
 from wbc_bench.errors import StoreError
 from wbc_bench.files import folder_name, write_atomic
+from wbc_bench.readers import decode_parquet, read_bytes, read_json
 
 
 class Driven(Protocol):
@@ -56,16 +58,28 @@ def write_record(path: Path, record: msgspec.Struct, beside: Path, data: bytes) 
     write_atomic(path, msgspec.json.format(msgspec.json.encode(record), indent=2) + b"\n")
 
 
-def read_record(path: Path, kind: type[Record], beside: Path, digest: str) -> tuple[Record, pa.Table]:
+def read_record(
+    path: Path, kind: type[Record], beside: Path, digest: str, columns: Mapping[str, str]
+) -> tuple[Record, pa.Table]:
     """A record, and the data beside it, whose SHA-256 stands in its field `digest`.
 
-    Raises: StoreError when one cannot be read or the data are not those it was written with.
+    Args:
+        path: The record.
+        kind: Its type.
+        beside: The data.
+        digest: Field of the record with their SHA-256.
+        columns: Columns that the data must have, with their types.
+
+    Raises: StoreError when one cannot be read, or the data are not those it was written with.
     """
-    try:
-        record = msgspec.json.decode(path.read_bytes(), type=kind)
-        data = beside.read_bytes()
-    except (OSError, msgspec.MsgspecError) as error:
-        raise StoreError(f"cannot read the record '{path}': {error}") from error
+    record = read_json(path, kind, "record", StoreError)
+    data = read_bytes(beside, "data of a record", StoreError)
     if hashlib.sha256(data).hexdigest() != getattr(record, digest):
         raise StoreError(f"'{beside}' is not what its {path.name} was written for: another sha256")
-    return record, pq.read_table(pa.BufferReader(data))
+    return record, decode_parquet(data, beside, "data of a record", StoreError, columns)
+
+
+def refuse_values(path: Path, mistakes: Iterable[tuple[str, object, str]]) -> None:
+    """Refuse the first of (name, value, what is valid). Raises: StoreError, there is one."""
+    for name, value, valid in mistakes:
+        raise StoreError(f"record '{path}': {name} is {value}, valid: {valid}")

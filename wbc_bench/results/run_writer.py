@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 from wbc_bench.errors import StoreError
 from wbc_bench.files import write_atomic
 from wbc_bench.outcomes import Outcome
+from wbc_bench.readers import read_parquet, reading
 from wbc_bench.results.store import ResultStore, Run, RunKey, RunRecord, ShardCost, identity, read_run_record
 
 DIFFERS = {  # field of a key -> what it is, in words
@@ -89,7 +90,7 @@ class RunWriter:
 
     def finish(self, facts: Mapping[str, Any]) -> Run:
         """Merge the shards, write the record, then remove the shards; `facts` completes the record."""
-        tables = [_read_table(self._shard_path(k)) for k in range(self.num_shards)]
+        tables = [read_parquet(self._shard_path(k), "shard", StoreError) for k in range(self.num_shards)]
         episodes = pa.concat_tables([table.replace_schema_metadata() for table in tables]).combine_chunks()
         key = self.key
         data = _parquet(episodes, identity(key))
@@ -169,11 +170,12 @@ class RunWriter:
             if not path.exists():
                 continue
             try:
-                table = _read_table(path, page_checksum_verification=True)
+                table = read_parquet(path, "shard", StoreError, page_checksum_verification=True)
                 facts = table.schema.metadata or {}
-                key = msgspec.json.decode(facts[b"key"], type=RunKey)
-                cost = msgspec.json.decode(facts[b"cost"], type=ShardCost)
-            except (OSError, KeyError, pa.ArrowException, msgspec.MsgspecError):
+                with reading("shard", path, "a shard of this store", StoreError):
+                    key = msgspec.json.decode(facts[b"key"], type=RunKey)
+                    cost = msgspec.json.decode(facts[b"cost"], type=ShardCost)
+            except StoreError:
                 path.replace(path.with_suffix(".damaged"))
                 continue
             if overwrite and msgspec.structs.replace(key, requested=self.key.requested) != self.key:
@@ -229,8 +231,3 @@ def _lock(folder: Path) -> int:
     except OSError:
         pass  # a file system without locks
     return descriptor
-
-
-def _read_table(path: Path, **options: Any) -> pa.Table:
-    # its bytes: pyarrow would take a path with a tilde or a colon for a home folder or a URI
-    return pq.read_table(pa.BufferReader(path.read_bytes()), **options)

@@ -8,6 +8,10 @@ which shard, when, and after how many interruptions stands only in run.json.
 """
 
 import hashlib
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -15,11 +19,14 @@ from typing import NamedTuple
 import msgspec
 import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import folder_name
-from wbc_bench.outcomes import SuccessRule
+from wbc_bench.outcomes import Outcome, SuccessRule
+from wbc_bench.readers import decode_parquet, read_bytes, read_json
+from wbc_bench.results.records import refuse_values
+
+KEYS = {"episode": "int64", "outcome": "string"}  # columns of every file of episodes
 
 
 class RunKey(msgspec.Struct, frozen=True, kw_only=True):
@@ -104,22 +111,22 @@ class Run:
         Raises: StoreError when the file is missing, or not the one that the record was written for.
         """
         path = self.path / "episodes.parquet"
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise StoreError(f"cannot read '{path}': {error.strerror}") from error
+        data = read_bytes(path, "episodes", StoreError)
         sha256 = hashlib.sha256(data).hexdigest()
         if sha256 != self.record.episodes_sha256:
             raise StoreError(
                 f"'{path}' is not what its run.json was written for: sha256 {sha256[:16]}..., "
                 f"recorded {self.record.episodes_sha256[:16]}..."
             )
-        table = pq.read_table(pa.BufferReader(data))
+        table = decode_parquet(data, path, "episodes", StoreError, KEYS, self.record.completed)
         written = table.schema.metadata or {}
         for name, value in identity(self.record).items():
-            found = written.get(name.encode(), b"").decode()
+            found = written.get(name.encode(), b"").decode(errors="replace")
             if found != value:
                 raise StoreError(f"'{path}' was written for {name} '{found}', its run.json says '{value}'")
+        ended = Counter(table["outcome"].to_pylist())
+        if ended != Counter({name: count for name, count in self.record.outcomes.items() if count}):
+            raise StoreError(f"'{path}' ended with {dict(ended)}, its run.json says {self.record.outcomes}")
         return table.replace_schema_metadata()
 
 
@@ -207,7 +214,30 @@ def _check_folder(run: Run) -> None:
 
 
 def read_run_record(path: Path) -> RunRecord:
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=RunRecord)
-    except (OSError, msgspec.MsgspecError) as error:
-        raise StoreError(f"cannot read run record '{path}': {error}") from error
+    """The record in a run's folder.
+
+    Raises: StoreError when it cannot be read, or its numbers contradict each other.
+    """
+    record = read_json(path, RunRecord, "run record", StoreError)
+    refuse_values(path, _mistakes(record))
+    return record
+
+
+def _mistakes(record: RunRecord) -> Iterator[tuple[str, object, str]]:
+    """(field, value, what is valid) of what the types of the fields cannot say."""
+    for name in ("protocol_digest", "manifest_sha256", "episodes_sha256", "software_sha256"):
+        if not re.fullmatch("[0-9a-z]{64}", getattr(record, name)):
+            yield name, f"'{getattr(record, name)}'", "64 hexadecimal digits"
+    for name, low in (("replicate", 0), ("completed", 1), ("shard_episodes", 1)):
+        if getattr(record, name) < low:
+            yield name, getattr(record, name), f"{low} or more"
+    if record.completed != record.requested:
+        yield "completed", record.completed, f"{record.requested}, as many as requested"
+    for name, count in record.outcomes.items():
+        if name not in list(Outcome) or count < 0:
+            yield f"outcomes.{name}", count, f"0 or more of {', '.join(Outcome)}"
+    if sum(record.outcomes.values()) != record.completed:
+        yield "sum of outcomes", sum(record.outcomes.values()), f"{record.completed}, as many as completed"
+    for name in record.rule.__struct_fields__:
+        if not 0 < getattr(record.rule, name) < math.inf:
+            yield f"rule.{name}", getattr(record.rule, name), "above 0"

@@ -12,8 +12,8 @@ import msgspec
 
 from wbc_bench.errors import BenchError, UnknownNameError
 from wbc_bench.files import PROTOCOLS, folder_name
+from wbc_bench.readers import read_toml
 from wbc_bench.results.analysis import Evaluated
-from wbc_bench.schema import read_toml
 
 FOLDER = PROTOCOLS / "studies"
 

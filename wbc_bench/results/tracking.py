@@ -3,7 +3,7 @@
 <root>/tracks/<source>/<controller>/<condition>_<seed>/track.json, series.parquet
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -14,9 +14,10 @@ import pandas as pd
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from wbc_bench.outcomes import TERMINATED
 from wbc_bench.results.formatting import CM, DEG, NONE, names_note, number_text
 from wbc_bench.results.metrics import spectral_arc_length
-from wbc_bench.results.records import driven_folder, parquet_of, read_record, write_record
+from wbc_bench.results.records import driven_folder, parquet_of, read_record, refuse_values, write_record
 from wbc_bench.results.table import Table
 from wbc_bench.rotations import geodesic_angle
 
@@ -212,7 +213,9 @@ def _key(record: TrackRecord) -> tuple[str, str, str, int]:
 
 
 def _read(path: Path) -> Track:
-    record, series = read_record(path, TrackRecord, path.with_name("series.parquet"), "series_sha256")
+    beside = path.with_name("series.parquet")
+    record, series = read_record(path, TrackRecord, beside, "series_sha256", SERIES)
+    refuse_values(path, _mistakes(record, len(series)))
     frame = series.to_pandas()
 
     def columns(*names: str) -> Array:
@@ -227,6 +230,26 @@ def _read(path: Path) -> Track:
         orientation_error=columns("orientation_error")[:, 0],
     )
     return Track(record, tracked)
+
+
+SERIES = dict.fromkeys(
+    (
+        *(f"{of}_{axis}" for of in ("target", "ee") for axis in "xyz"),
+        *("position_error", "orientation_error"),
+    ),
+    "double",
+)
+
+
+def _mistakes(record: TrackRecord, steps: int) -> Iterator[tuple[str, object, str]]:
+    """(field, value, what is valid) of what the series beside a record contradict."""
+    outcomes = (STOOD, *map(str, TERMINATED))
+    if record.outcome not in outcomes:
+        yield "outcome", f"'{record.outcome}'", ", ".join(outcomes)
+    if not 1e-4 <= record.control_period <= 1.0:
+        yield "control_period", record.control_period, "0.0001 to 1 s"
+    if abs(steps * record.control_period - record.completed_s) > 1e-6:
+        yield "completed_s", record.completed_s, f"{steps} steps of {record.control_period:g} s"
 
 
 # --- table ----------------------------------------------------------------------------------------------

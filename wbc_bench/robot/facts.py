@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
+from wbc_bench.readers import read_toml
 
 Vec3 = tuple[float, float, float]
 Gain = tuple[float, float]  # (kp [N m/rad], kd [N m s/rad])
@@ -178,10 +179,7 @@ def load_facts(variant: str = DEFAULT_VARIANT, path: Path = FACTS_FILE) -> Facts
         ProtocolError: the file cannot be read or a field is wrong (its path is named).
         UnknownNameError: the file has no such variant.
     """
-    try:
-        facts = msgspec.toml.decode(path.read_bytes(), type=Facts)
-    except (OSError, msgspec.DecodeError) as error:
-        raise ProtocolError(f"robot facts {path}: {error}") from error
+    facts = read_toml(path, Facts, "robot facts", ProtocolError)
     if variant not in facts.variants:
         raise UnknownNameError("robot variant", variant, facts.variants, "robot.variant")
     chosen = facts.variants[variant]

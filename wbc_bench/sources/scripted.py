@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 
 from wbc_bench.errors import SourceError
+from wbc_bench.readers import read_toml
 from wbc_bench.rotations import matrix_from_rpy, wxyz_from_matrix
-from wbc_bench.schema import meaning_digest, read_toml
+from wbc_bench.schema import meaning_digest
 from wbc_bench.sources.interface import Frame, Seen, StampedTarget, from_world
 from wbc_bench.sources.paths import MAX_CYCLES, Path, Piece, Rest, laps, line
 from wbc_bench.sources.slew import Limits, Pose

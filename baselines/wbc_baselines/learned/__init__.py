@@ -9,6 +9,7 @@ import msgspec
 from wbc_baselines.learned.packaged import CHECKPOINTS
 from wbc_bench.controller import Controller
 from wbc_bench.errors import ControllerError, missing_extra
+from wbc_bench.readers import read_json
 from wbc_bench.robot import Robot
 
 
@@ -40,7 +41,7 @@ class Learned:
     def variants(self) -> list[tuple[str, str]]:
         """Return METHOD and METHOD@SEED of every packaged checkpoint, and how long each was trained."""
         paths = sorted(CHECKPOINTS.glob("*@*.json"))
-        cards = [msgspec.json.decode(path.read_bytes(), type=_Training) for path in paths]
+        cards = [read_json(path, _Training, "checkpoint card", ControllerError) for path in paths]
         seeds: dict[str, list[_Training]] = {}
         for card in cards:
             seeds.setdefault(card.method, []).append(card)

@@ -2,23 +2,22 @@
 
 import hashlib
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import load as tensors_of
 from safetensors.torch import save as bytes_of
 from torch import Tensor, nn
 
 from wbc_bench.errors import SourceError
 from wbc_bench.files import write_atomic
+from wbc_bench.readers import decode_json, read_bytes, reading
 from wbc_bench.sources.diffusion import poses
 from wbc_bench.sources.diffusion.demonstrations import DOOR
 from wbc_bench.sources.diffusion.denoising import Denoiser, sample
 from wbc_bench.sources.slew import Pose
+from wbc_bench.tensors import decode_tensors
 
 Array = NDArray[np.float64]
 FORMAT = 1
@@ -46,6 +45,12 @@ class DoorPolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     git_commit: str | None
     git_dirty: bool
     torch: str  # version
+
+
+class _Header(msgspec.Struct):
+    """What is read here of a safetensors file's header."""
+
+    metadata: dict[str, str] = msgspec.field(default_factory=dict, name="__metadata__")
 
 
 class Policy(nn.Module):
@@ -98,38 +103,28 @@ def load_policy(path: Path) -> tuple[Policy, DoorPolicyCard, str]:
 
     Raises: SourceError when the file is missing, damaged, no policy, or of another format or size.
     """
-    card = read_card(path)
-    data = path.read_bytes()
+    data = read_bytes(path, "policy", SourceError)
+    card = _card(data, path)
     policy = Policy(card.hidden)
-    tensors, wanted = tensors_of(data), policy.state_dict()
-    shapes: dict[str, Any] = {name: tuple(value.shape) for name, value in tensors.items()}
-    for name, value in wanted.items():
-        if shapes.get(name) != tuple(value.shape):
-            raise SourceError(
-                f"policy '{path}': tensor {name} is {shapes.get(name, 'missing')}, "
-                f"valid: {tuple(value.shape)}"
-            )
-        if not tensors[name].isfinite().all():
-            raise SourceError(f"policy '{path}': tensor {name} holds a number that is not finite")
-    policy.load_state_dict(tensors)
+    policy.load_state_dict(decode_tensors(data, path, "policy", SourceError, policy.state_dict()))
     return policy.eval(), card, hashlib.sha256(data).hexdigest()
 
 
 def read_card(path: Path) -> DoorPolicyCard:
     """The card of a policy's file. Raises: SourceError."""
-    if not path.is_file():
-        raise SourceError(f"policy '{path}' does not exist")
-    try:
-        with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(CARD)
-    except (OSError, SafetensorError) as error:
-        raise SourceError(f"policy '{path}' is damaged, valid: a safetensors file: {error}") from error
-    if text is None:
+    return _card(read_bytes(path, "policy", SourceError), path)
+
+
+def _card(data: bytes, path: Path) -> DoorPolicyCard:
+    with reading("policy", path, "a safetensors file", SourceError):
+        # the format: eight bytes with the length of a header in JSON. Source: safetensors, README
+        size = int.from_bytes(data[:8], "little")
+        if len(data) < 8 or size > len(data) - 8:
+            raise ValueError("its header is cut short")
+        metadata = msgspec.json.decode(data[8 : 8 + size], type=_Header).metadata
+    if CARD not in metadata:
         raise SourceError(f"policy '{path}' has no card in its metadata: it is of another program")
-    try:
-        card = msgspec.json.decode(text, type=DoorPolicyCard)
-    except msgspec.DecodeError as error:
-        raise SourceError(f"policy '{path}': card: {error}") from error
+    card = decode_json(metadata[CARD], path, DoorPolicyCard, "card of the policy", SourceError)
     if card.format != FORMAT or not 1 <= card.hidden <= 1 << 12:
         raise SourceError(
             f"policy '{path}': format {card.format} with {card.hidden} hidden units, "

@@ -5,6 +5,7 @@ limits, default posture or end-effector frame of the robot differ from those of 
 """
 
 import hashlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench import provenance
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, UnknownNameError
+from wbc_bench.readers import decode_json, read_bytes
 from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of, without_sources
 from wbc_bench.schema import meaning
 
@@ -186,9 +188,9 @@ def read_card(path: Path) -> PolicyCard:
     """
     beside = card_path(path)
     for file in (path, beside):
-        if not file.is_file():
+        if not os.path.isfile(file):  # noqa: PTH113  (false for a name that is too long, where Path raises)
             raise CheckpointError(f"checkpoint '{path}': there is no file '{file}'")
-    return decode_card(beside.read_bytes(), str(beside))
+    return decode_card(read_bytes(beside, "checkpoint card", CheckpointError), str(beside))
 
 
 def decode_card(text: bytes, where: str) -> PolicyCard:
@@ -205,13 +207,10 @@ def decode_card(text: bytes, where: str) -> PolicyCard:
         CheckpointError: The card is damaged, altered, or of another format or other dimensions.
         UnknownNameError: There is no such method.
     """
-    try:
-        version = msgspec.json.decode(text, type=_Version).format
-        if version != FORMAT:
-            raise CheckpointError(f"checkpoint card '{where}' has format {version}, valid: {FORMAT}")
-        card = msgspec.json.decode(text, type=PolicyCard)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"checkpoint card '{where}' cannot be read: {error}") from error
+    version = decode_json(text, where, _Version, "checkpoint card", CheckpointError).format
+    if version != FORMAT:
+        raise CheckpointError(f"checkpoint card '{where}' has format {version}, valid: {FORMAT}")
+    card = decode_json(text, where, PolicyCard, "checkpoint card", CheckpointError)
     if card.method not in METHODS:
         raise UnknownNameError("method", card.method, METHODS, where)
     here = _dimensions(make_estimator(METHODS[card.method].estimator))
@@ -219,6 +218,10 @@ def decode_card(text: bytes, where: str) -> PolicyCard:
         raise CheckpointError(f"checkpoint card '{where}' has other dimensions: {differences}")
     if card.robot_digest != _digest(card.robot):
         raise CheckpointError(f"checkpoint card '{where}' was altered: its robot does not match its digest")
+    if not card.robot.control_period > 0:
+        raise CheckpointError(
+            f"checkpoint card '{where}': control period {card.robot.control_period:g} s, valid: above 0"
+        )
     return card
 
 

@@ -1,14 +1,10 @@
 """Checkpoints: weights and normalizers as safetensors, with a card (see `card`) beside them."""
 
 import hashlib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-import torch
-from safetensors import SafetensorError
-from safetensors.torch import load as tensors_of
 from safetensors.torch import save as bytes_of
 
 from wbc_baselines.learned.packaged import CHECKPOINTS
@@ -20,7 +16,9 @@ from wbc_baselines.learned.policy.networks import Actor
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.files import write_atomic
+from wbc_bench.readers import read_bytes
 from wbc_bench.robot import Robot, load_robot
+from wbc_bench.tensors import decode_tensors
 
 
 class Checkpoint(NamedTuple):
@@ -70,7 +68,7 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
         UnknownNameError: There is no such method.
     """
     card = read_card(path)
-    data = path.read_bytes()
+    data = read_bytes(path, "checkpoint", CheckpointError)
     found = hashlib.sha256(data).hexdigest()
     if found != card.sha256:
         raise CheckpointError(
@@ -82,11 +80,11 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
     check_fit(card, robot, protocol.control_period if protocol else None, str(path))
     estimator = make_estimator(METHODS[card.method].estimator)
     actor = Actor(estimator.context_dim)
-    try:
-        tensors = tensors_of(data)
-    except SafetensorError as error:
-        raise CheckpointError(f"checkpoint '{path}' is not a safetensors file: {error}") from error
-    _fill(path, {"actor": actor, "estimator": estimator}, tensors)
+    modules = {"actor": actor, "estimator": estimator}
+    wanted = {f"{part}.{name}": v for part, m in modules.items() for name, v in m.state_dict().items()}
+    tensors = decode_tensors(data, path, "checkpoint", CheckpointError, wanted)
+    for name, value in wanted.items():
+        value.copy_(tensors[name])
     return Checkpoint(card, actor.eval(), estimator.eval())
 
 
@@ -182,21 +180,3 @@ def find(name: str) -> Path:
 def available() -> list[str]:
     """List the checkpoints of this package as METHOD@SEED."""
     return sorted(path.stem for path in CHECKPOINTS.glob("*@*.safetensors"))
-
-
-def _fill(path: Path, modules: dict[str, torch.nn.Module], tensors: dict[str, torch.Tensor]) -> None:
-    """Put tensors into modules; names and shapes must match, one to one."""
-    wanted = {f"{part}.{name}": v for part, m in modules.items() for name, v in m.state_dict().items()}
-
-    def refuse(problem: str, names: Iterable[str]) -> None:
-        if names := sorted(names):
-            raise CheckpointError(
-                f"checkpoint '{path}': {problem} {', '.join(names[:3])} ({len(names)} in all)"
-            )
-
-    refuse("it lacks", wanted.keys() - tensors.keys())
-    refuse("it has tensors that the method does not know,", tensors.keys() - wanted.keys())
-    refuse("wrong shape of", [name for name, v in wanted.items() if v.shape != tensors[name].shape])
-    refuse("not a number in", [name for name, v in tensors.items() if not v.isfinite().all()])
-    for name, value in wanted.items():
-        value.copy_(tensors[name])
