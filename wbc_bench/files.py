@@ -4,6 +4,7 @@ import contextlib
 import errno
 import hashlib
 import os
+import re
 from pathlib import Path
 
 from wbc_bench.errors import StoreError
@@ -32,6 +33,12 @@ def folder_name(name: str) -> str:
     if len(plain) > LONGEST_NAME:
         plain = f"{plain[:LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     return plain
+
+
+def is_folder_name(name: str) -> bool:
+    """Whether a name is a folder's as it stands, so that whoever has the name finds the folder, and back."""
+    plain = re.fullmatch(r"[\w@]([\w.@-]*[\w@])?", name, re.ASCII)
+    return plain is not None and len(name) <= LONGEST_NAME
 
 
 def write_atomic(path: Path, data: bytes) -> None:

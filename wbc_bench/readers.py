@@ -151,26 +151,24 @@ def decode_parquet(
         pq.ParquetFile(pa.BufferReader(data), **options) as file,
     ):
         parts = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
-        size, cells = (
-            sum(part.total_byte_size for part in parts),
-            file.metadata.num_rows * 8 * len(file.schema),
-        )
-        if max(size, cells) > LARGEST_TABLE:
+        found = file.metadata.num_rows
+        size = max(sum(part.total_byte_size for part in parts), 8 * found * len(file.schema))
+        if size > LARGEST_TABLE:
             raise error(
-                f"{kind} '{path}' holds {file.metadata.num_rows} rows of {size} bytes, valid: at most "
-                f"{LARGEST_TABLE} bytes"
+                f"{kind} '{path}' holds {found} rows of {size} bytes, valid: at most {LARGEST_TABLE} bytes"
             )
-        if rows is not None and file.metadata.num_rows != rows:
-            raise error(f"{kind} '{path}' has {file.metadata.num_rows} rows, valid: {rows}")
+        if rows is not None and found != rows:
+            raise error(f"{kind} '{path}' has {found} rows, valid: {rows}")
         table = file.read()
         table.validate(full=True)
-        _check_columns(table, path, kind, error, columns or {})
-        return table
+    check_columns(table, path, kind, error, columns or {})
+    return table
 
 
-def _check_columns(
+def check_columns(
     table: "pa.Table", path: Path | str, kind: str, error: type[BenchError], columns: Mapping[str, str]
 ) -> None:
+    """Check a table as `decode_parquet` does. Raises: `error`: a column is missing or of another type."""
     names = table.column_names
     if len(set(names)) < len(names):
         raise error(f"{kind} '{path}' has two columns of one name, valid: each once")

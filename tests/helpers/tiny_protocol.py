@@ -7,6 +7,8 @@ import numpy as np
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, neutral, write_manifest
 from wbc_bench.episodes.protocol import MAX_PUSHES, read_protocol
+from wbc_bench.episodes.randomization import resting_height
+from wbc_bench.robot import RobotConfig
 
 TOML = """
 name = "tiny"
@@ -30,6 +32,12 @@ weights = {{ arm = 1 }}
 step_distance = [0.1, 0.2]
 step_yaw = [0.0, 0.0]
 
+[randomization]
+friction = [0.5, 1.0]
+base_mass = [0.0, 1.0]
+base_lin_vel = 0.1
+base_ang_vel = 0.1
+
 [noise]
 joint_pos = 0.01
 
@@ -52,8 +60,8 @@ def manifest(replicates: int, episodes: int) -> EpisodeManifest:
         height=np.full(count, 0.9),
         target_pos_w=np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.full(count, 0.9)]),
         target_quat_w=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-        feasible_qpos=np.full((count, 21), np.nan),
-        base_height=np.full(count, 0.85),
+        feasible_qpos=np.tile([0.0, 0.0, 0.85, 1.0, *[0.0] * 17], (count, 1)),
+        base_height=np.full(count, resting_height(RobotConfig(), np.zeros(8))),
         friction=rng.uniform(0.5, 1.0, count),
         base_mass=rng.uniform(0.0, 1.0, count),
         base_vel=rng.uniform(-0.1, 0.1, (count, 6)),

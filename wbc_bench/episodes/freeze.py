@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from wbc_bench.episodes.kinds import kind_of
-from wbc_bench.episodes.manifest import EpisodeManifest, write_manifest
+from wbc_bench.episodes.manifest import write_manifest
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import Progress
 from wbc_bench.errors import ManifestError
 from wbc_bench.files import PROTOCOLS

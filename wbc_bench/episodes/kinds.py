@@ -5,8 +5,8 @@ from typing import Protocol
 import numpy as np
 
 from wbc_bench.episodes import reach_targets, workspace_targets
-from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol, ReachTargets, WorkspaceTargets
+from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import Progress
 
 
@@ -23,6 +23,10 @@ class TargetKind(Protocol):
 
     def count_mistakes(self, protocol: EvalProtocol, manifest: EpisodeManifest) -> list[str]:
         """What is wrong with how the episodes of a manifest are divided up."""
+        ...
+
+    def target_mistakes(self, protocol: EvalProtocol, manifest: EpisodeManifest) -> list[str]:
+        """What is wrong with the labels of a manifest, and with where its targets are."""
         ...
 
     def step_distance(self, protocol: EvalProtocol) -> tuple[float, float]:

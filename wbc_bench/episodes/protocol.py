@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal, NoReturn
 import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
-from wbc_bench.files import PROTOCOLS
+from wbc_bench.files import LONGEST_NAME, PROTOCOLS, is_folder_name
 from wbc_bench.readers import read_toml
 from wbc_bench.robot import RobotConfig, load_facts
 from wbc_bench.schema import meaning_digest
@@ -25,6 +25,12 @@ PositiveRange = tuple[Positive, Positive]
 Delay = Annotated[float, msgspec.Meta(ge=0, le=0.2)]  # [s] more than any control stack has
 Angle = Annotated[float, msgspec.Meta(ge=0, le=0.5)]  # [rad] beyond it nothing stands
 DelayRange = tuple[Delay, Delay]
+REACH_X = (0.0, 1.0)  # [m] ahead of the base, where reach targets are; the arm is 0.8 m long
+
+# Limits of what an evaluation holds in memory
+LONGEST = 600.0  # [s] of an episode, whose noise and pushes are drawn in advance
+MAX_STEPS = 30_000  # control steps of an episode: 0.25 GB of time series in a shard of 50 episodes
+MAX_EPISODES = 100_000  # of a protocol: 0.1 GB of rows in its manifest
 
 MAX_PUSHES = 2  # columns of a manifest; `read_protocol` refuses a schedule with room for more
 
@@ -36,9 +42,9 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 class Episodes(_Table, frozen=True):
     """How many episodes, how long, and the seed of every draw in them."""
 
-    replicates: Count
-    per_replicate: Count
-    horizon: Positive  # [s]
+    replicates: Annotated[int, msgspec.Meta(ge=1, le=1000)]
+    per_replicate: Annotated[int, msgspec.Meta(ge=1, le=MAX_EPISODES)]
+    horizon: Annotated[float, msgspec.Meta(gt=0, le=LONGEST)]  # [s]
     seed: Annotated[int, msgspec.Meta(ge=0)]
 
 
@@ -47,8 +53,8 @@ class Physics(_Table, frozen=True):
 
     LATER: ClassVar[frozenset[str]] = frozenset({"cone"})
 
-    timestep: Positive = 0.002  # [s]
-    decimation: Count = 10
+    timestep: Annotated[float, msgspec.Meta(ge=1e-4, le=0.02)] = 0.002  # [s]
+    decimation: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 10
     cone: Literal["elliptic", "pyramidal"] = "elliptic"  # of the friction; docs/protocols.md says why
 
 
@@ -64,7 +70,7 @@ class WorkspaceTargets(_Table, frozen=True, tag="workspace"):
     roll: Range  # [rad]
     pitch: Range  # [rad]
     yaw: Range  # [rad]
-    weights: dict[Literal["arm", "posture", "step"], Count]
+    weights: dict[Literal["arm", "posture", "step"], Annotated[int, msgspec.Meta(ge=1, le=1000)]]
     step_distance: Range  # [m] how far the stance of a `step` target is displaced
     step_yaw: Range  # [rad] and how far it is turned
     com_margin: NonNegative = 0.02  # [m] of the centre of mass inside the soles' hull
@@ -83,7 +89,7 @@ class ReachTargets(_Table, frozen=True, tag="reach"):
     """Targets straight ahead over a ladder of heights."""
 
     heights: tuple[float, float, Positive]  # [m] (lowest, highest, spacing)
-    per_height: Count
+    per_height: Annotated[int, msgspec.Meta(ge=1, le=MAX_EPISODES)]
     dither: NonNegative  # [m] uniform offset of each episode's target, so that no two are the same
     orientations: tuple[Literal["free", "horizontal"], ...]
     conditions: tuple[Literal["nominal", "randomised"], ...]
@@ -102,9 +108,11 @@ class ReachTargets(_Table, frozen=True, tag="reach"):
 
     def mistakes(self, episodes: Episodes) -> Iterator[tuple[str, str]]:
         """(what is wrong, path of the field), what the types of the fields cannot say."""
-        low, high, _ = self.heights
+        low, high, spacing = self.heights
         if not 0 <= low <= high:
             yield f"heights {low:g} to {high:g} m, valid: 0 <= low <= high", "targets.heights"
+        if (high - low) / spacing > MAX_EPISODES:
+            yield f"spacing {spacing:g} m makes more than {MAX_EPISODES} heights", "targets.heights"
         for name in ("orientations", "conditions"):
             names = getattr(self, name)
             if not names or len(set(names)) < len(names):
@@ -266,12 +274,12 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
         path = Path(name)
     else:
         path = PROTOCOLS / f"{name}.toml"
-        if not path.exists():
+        if name not in protocol_names():
             raise UnknownNameError("protocol", name, protocol_names(), "--protocol")
     protocol = read_protocol(path)
     released = PROTOCOLS / f"{protocol.name}.toml"
     own = path.resolve() != released.resolve()
-    if own and released.exists() and protocol.digest != read_protocol(released).digest:
+    if own and protocol.name in protocol_names() and protocol.digest != read_protocol(released).digest:
         raise ProtocolError(
             f"protocol {path}: '{protocol.name}' is the name of a released protocol, and this one differs: "
             "give it another - at `$.name`"
@@ -311,8 +319,22 @@ def _check(protocol: EvalProtocol, path: Path) -> None:
     for field in protocol.__struct_fields__:
         walk(getattr(protocol, field), field)
 
+    if not is_folder_name(protocol.name):
+        refuse(
+            f"'{protocol.name}' cannot name a folder of results, valid: 1 to {LONGEST_NAME} ASCII letters, "
+            "digits, '_' and '@', with '.' and '-' between them",
+            "name",
+        )
+    episodes = protocol.episodes
+    if episodes.replicates * episodes.per_replicate > MAX_EPISODES:
+        refuse(
+            f"{episodes.replicates} x {episodes.per_replicate} episodes, valid: at most {MAX_EPISODES}",
+            "episodes.per_replicate",
+        )
     horizon, period = protocol.episodes.horizon, protocol.control_period
     for name, seconds in (("episodes.horizon", horizon), ("success.window", protocol.success.window)):
+        if seconds / period > MAX_STEPS:
+            refuse(f"{seconds:g} s has more than {MAX_STEPS} control periods of {period:g} s", name)
         if abs(seconds / period - round(seconds / period)) > 1e-6 or seconds < period / 2:
             refuse(f"{seconds:g} s is not a whole number of control periods of {period:g} s", name)
     if protocol.success.window > horizon:

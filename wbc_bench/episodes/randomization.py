@@ -11,8 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.episodes.manifest import neutral
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Push
+from wbc_bench.episodes.rows import neutral
 from wbc_bench.episodes.terrain import TERRAIN_SPAN, highest_near
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, RobotConfig, load_robot

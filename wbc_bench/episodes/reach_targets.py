@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.episodes.manifest import EpisodeManifest
-from wbc_bench.episodes.protocol import EvalProtocol, ReachTargets
+from wbc_bench.episodes.protocol import REACH_X, EvalProtocol, ReachTargets
+from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.static_solver import StaticSolver
 from wbc_bench.episodes.targets import (
     BEYOND,
@@ -27,8 +27,8 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 # Search for the best pose of a height: (spacing, reach) about the best so far. Straight up and down included.
-REACH_X = (0.0, 1.0)  # [m] ahead of the base; the arm is 0.8 m long
 REACH_PITCH = (-np.pi / 2, np.pi / 2)  # [rad]
+ROUNDING = 1e-9  # [m] of a sum
 COARSE = (0.1, np.pi / 12)  # [m], [rad]
 FINE = (0.025, np.pi / 48)
 
@@ -186,6 +186,33 @@ def count_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[st
     if set(cells.values()) == {targets.per_height}:
         return []
     return [f"episodes per height: {sorted(set(cells.values()))}, {targets.per_height} expected"]
+
+
+def target_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[str]:
+    """Episodes out of the order of `rows`, and targets farther than the dither from their height."""
+    targets, wrong = protocol.targets, []
+    assert isinstance(targets, ReachTargets)
+    heights, sizes = ladder(targets), (len(targets.conditions), len(targets.orientations))
+    condition, orientation, rung, _ = np.indices((*sizes, len(heights), targets.per_height)).reshape(4, -1)
+    for name, expected in (
+        ("condition", np.array(targets.conditions, dtype=object)[condition]),
+        ("orientation", np.array(targets.orientations, dtype=object)[orientation]),
+        ("height", heights[rung]),
+    ):
+        if not np.array_equal(getattr(manifest, name), expected):
+            wrong.append(f"{name} of some episodes is not the one that their number stands for")
+    x, y, z = manifest.target_pos_w.T
+    most = targets.dither + ROUNDING
+    within = (REACH_X[0] - most <= x) & (x <= REACH_X[1] + most) & (np.abs(y) <= most)
+    within &= np.abs(z - manifest.height) <= most
+    if not within.all():
+        i = int(within.argmin())
+        wrong.append(
+            f"target of episode {manifest.replicate[i]}/{manifest.episode[i]} at "
+            f"{manifest.target_pos_w[i].tolist()} m "
+            f"is not within {targets.dither:g} m of its height straight ahead"
+        )
+    return wrong
 
 
 def step_distance(protocol: EvalProtocol) -> tuple[float, float]:

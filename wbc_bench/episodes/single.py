@@ -5,15 +5,14 @@ import dataclasses
 import msgspec
 import numpy as np
 
-from wbc_bench.episodes.manifest import EpisodeManifest
-from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
+from wbc_bench.episodes.protocol import LONGEST, EvalProtocol, find_protocol
 from wbc_bench.episodes.randomization import nominal, sample
+from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.errors import SourceError, UnknownNameError
 
 CONDITIONS = ("nominal", "randomised")
 BASE_PROTOCOL = "ablation_v1"  # whose physics, randomisation, noise, pushes and limits hold
 UNSCRIPTED = 20.0  # [s] for a source that has no end
-LONGEST = 600.0  # [s] the noise and the pushes of a whole episode are drawn in advance
 
 
 def door_protocol(seed: int) -> EvalProtocol:

@@ -8,17 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from wbc_bench.episodes.kinds import kind_of
-from wbc_bench.episodes.manifest import EpisodeManifest, neutral, read_manifest
+from wbc_bench.episodes.manifest import read_manifest
+from wbc_bench.episodes.manifest_values import SAME, bounds, height_error, mistakes
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.episodes.randomization import resting_height
+from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import BEYOND, solver_of
-from wbc_bench.episodes.terrain import TERRAIN_SPAN
 from wbc_bench.errors import ManifestError
 from wbc_bench.randomness import stream
-from wbc_bench.robot import load_robot
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
-
-SAME = 1e-9  # [m, rad] another processor rounds differently
 
 
 class Check(NamedTuple):
@@ -32,7 +29,7 @@ class Check(NamedTuple):
 def verify(protocol: EvalProtocol, path: Path, sample: int = 30, seed: int = 0) -> list[Check]:
     """Everything a manifest promises; `sample` rows chosen by `seed` are drawn again and tried."""
     try:
-        manifest, sha256 = read_manifest(protocol, path)
+        manifest, sha256 = read_manifest(protocol, path, check_values=False)
     except ManifestError as error:
         return [Check("hash and digest", False, str(error))]
     rows = np.sort(stream(seed, "verify").permutation(len(manifest))[:sample])
@@ -60,71 +57,16 @@ def _check_counts(protocol: EvalProtocol, manifest: EpisodeManifest) -> Check:
 
 
 def _check_ranges(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Check]:
-    spread, push = protocol.randomization, protocol.push
-    slide = load_robot(protocol.robot).facts.friction.slide
-    drawn = manifest.condition != "nominal"
-    noisy = manifest.take(np.flatnonzero(drawn))
-    quiet = manifest.take(np.flatnonzero(~drawn))
-    norm = np.linalg.norm(manifest.target_quat_w, axis=1)
-    velocity = [spread.base_lin_vel] * 3 + [spread.base_ang_vel] * 3
-    bounds = [
-        ("friction", noisy.friction, *spread.friction),
-        ("base_mass", noisy.base_mass, *spread.base_mass),
-        ("base_vel", noisy.base_vel, -np.array(velocity), np.array(velocity)),
-        ("leg_q", noisy.leg_q, -spread.leg_q, spread.leg_q),
-        ("leg_qd", noisy.leg_qd, -spread.leg_qd, spread.leg_qd),
-        ("kp_scale", noisy.kp_scale, *spread.gain),
-        ("kd_scale", noisy.kd_scale, *spread.gain),
-        ("push_time", noisy.push_time, push.interval[0], protocol.episodes.horizon - push.quiet_end),
-        ("push_vel", noisy.push_vel, -push.speed, push.speed),
-        ("push_vel_z", noisy.push_vel_z, -push.vertical_speed, push.vertical_speed),
-        ("push_ang_vel", noisy.push_ang_vel, -push.angular_speed, push.angular_speed),
-        *((name, getattr(noisy, name), *getattr(spread, name)) for name in _LATER_RANGES),
-        ("odometry_drift", noisy.odometry_drift, spread.odometry_drift, spread.odometry_drift),
-        ("payload_offset", noisy.payload_offset, -spread.payload_offset, spread.payload_offset),
-        ("joint_offset", noisy.joint_offset, -spread.joint_offset, spread.joint_offset),
-        ("imu_tilt", np.linalg.norm(noisy.imu_tilt, axis=1), 0, spread.gravity_tilt + SAME),
-        ("slope", np.linalg.norm(noisy.slope, axis=1), 0, spread.slope + SAME),
-        ("terrain_offset", noisy.terrain_offset, -TERRAIN_SPAN, TERRAIN_SPAN),
-        ("noise_scale", noisy.noise_scale, 1, 1),
-        ("target quaternion", norm, 1 - 1e-12, 1 + 1e-12),
-        ("nominal friction", quiet.friction, slide, slide),
-        *((f"nominal {name}", getattr(quiet, name), 0, 0) for name in _ZERO_IF_NOMINAL),
-        *((f"nominal {name}", getattr(quiet, name), value, value) for name, value in _later_nominal()),
-        ("nominal kp_scale", quiet.kp_scale, 1, 1),
-        ("nominal kd_scale", quiet.kd_scale, 1, 1),
+    checks = [
+        Check(f"range of {bound.name}", bound.inside, bound.extent) for bound in bounds(protocol, manifest)
     ]
-    checks = []
-    for name, values, low, high in bounds:
-        if values.size == 0 or np.isnan(values).all():
-            continue
-        inside = np.isnan(values) | ((values >= low) & (values <= high))
-        detail = f"{np.nanmin(values):.4g} to {np.nanmax(values):.4g}"
-        checks.append(Check(f"range of {name}", bool(inside.all()), detail))
-    pushes = np.isfinite(noisy.push_time)
-    if not push.some or not np.isnan(quiet.push_time).all():
-        checks.append(
-            Check("no pushes", not pushes.any() and bool(np.isnan(quiet.push_time).all()), "none asked")
-        )
-    grounds = zip(manifest.leg_q[:200], manifest.slope, manifest.terrain_offset, strict=False)
-    heights = [
-        resting_height(protocol.robot, leg_q, slope, 0.0 if calm else spread.step_height, offset)
-        for (leg_q, slope, offset), calm in zip(grounds, ~drawn, strict=False)
-    ]
-    worst = float(np.abs(heights - manifest.base_height[:200]).max())
+    if protocol.push.speed == 0:
+        checks.append(Check("no pushes", bool(np.isnan(manifest.push_time).all()), "none asked"))
+    worst = height_error(protocol, manifest)
     checks.append(Check("soles on the ground at reset", worst < SAME, f"off by at most {worst:.1e} m"))
+    wrong = list(mistakes(protocol, manifest))
+    checks.append(Check("values", not wrong, "; ".join(wrong) or "labels, targets, draws and pushes"))
     return checks
-
-
-_LATER_RANGES = ("command_delay", "observation_delay", "odometry_delay", "payload", "motor_strength")
-
-
-def _later_nominal() -> list[tuple[str, float]]:
-    """The later columns and the one value that a nominal episode has in each."""
-    return [(name, float(column.flat[0])) for name, column in neutral(1).items()]
-
-
-_ZERO_IF_NOMINAL = ("base_mass", "base_vel", "leg_q", "leg_qd", "push_vel", "noise_scale")
 
 
 def _check_witnesses(protocol: EvalProtocol, manifest: EpisodeManifest) -> Check:

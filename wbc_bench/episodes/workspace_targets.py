@@ -5,8 +5,8 @@ from collections import Counter
 import numpy as np
 
 from wbc_bench.episodes.ground_frame import GroundFrame, from_ground_frame
-from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
+from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import (
     MAX_ATTEMPTS,
     Progress,
@@ -21,6 +21,7 @@ from wbc_bench.outcomes import STRATA
 from wbc_bench.randomness import stream
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 
+ROUNDING = 1e-9  # [m] of a pose that went through a displaced frame
 CHUNK = 16  # episodes a task: a second of work
 
 
@@ -113,6 +114,30 @@ def count_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[st
         if part.stratum.tolist() != asked:
             found, expected = dict(Counter(part.stratum)), dict(Counter(asked))
             wrong.append(f"replicate {replicate}: strata {found}, {expected} in turn expected")
+    return wrong
+
+
+def target_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[str]:
+    """Targets outside the box, which is displaced with the stance for `step`, and labels of another kind."""
+    targets, wrong = protocol.targets, []
+    assert isinstance(targets, WorkspaceTargets)
+    if any(manifest.condition) or any(manifest.orientation):
+        wrong.append("conditions and orientations belong to reach targets, valid: none")
+    if not np.array_equal(manifest.height, manifest.target_pos_w[:, 2]):
+        wrong.append("height is not that of the target")
+    x, y, z = manifest.target_pos_w.T
+    corner = np.hypot(*np.abs([targets.x, targets.y]).max(axis=1))
+    within = (targets.x[0] <= x) & (x <= targets.x[1]) & (targets.y[0] <= y) & (y <= targets.y[1])
+    near = np.hypot(x, y) <= corner + targets.step_distance[1] + ROUNDING
+    within = np.where(manifest.stratum == "step", near, within)
+    within &= (targets.height[0] - ROUNDING <= z) & (z <= targets.height[1] + ROUNDING)
+    if not within.all():
+        i = int(within.argmin())
+        wrong.append(
+            f"target of episode {manifest.replicate[i]}/{manifest.episode[i]} at "
+            f"{manifest.target_pos_w[i].tolist()} m "
+            "is outside the protocol's box"
+        )
     return wrong
 
 

@@ -1,7 +1,7 @@
 """Export of policies as ONNX files, with window and recurrent state as explicit inputs and outputs.
 
 The normalizers are part of the graph. The file contains the checkpoint's card, so that `onnx:FILE` is checked
-against the robot like a checkpoint.
+against the robot like a checkpoint, and ends in the digest of its bytes.
 """
 
 import tempfile
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from wbc_baselines.learned.policy.card import PolicyCard
-from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, _output
+from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, _output, seal
 from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.files import write_atomic
 
@@ -58,4 +58,5 @@ def write_onnx(path: Path, policy: Policy, card: PolicyCard) -> None:
         )
         model = onnx.load(raw)
     onnx.helper.set_model_props(model, {CARD: msgspec.json.encode(card).decode()})
-    write_atomic(path, model.SerializeToString(deterministic=True))
+    data = model.SerializeToString(deterministic=True)
+    write_atomic(path, data + seal(data))

@@ -12,9 +12,10 @@ from wbc_baselines.learned.policy.card import CheckpointError, decode_card
 from wbc_baselines.learned.policy.estimators import make_estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.policy import flow_of
+from wbc_bench.readers import read_bytes, reading
 
 OPSET = 17
-CARD = "card"  # key of the metadata
+CARD, DIGEST = "card", b"sha256"  # keys of the metadata
 
 
 class OnnxEngine:
@@ -29,35 +30,70 @@ class OnnxEngine:
         Raises:
             CheckpointError: The file is missing, damaged, or was not exported by this package.
         """
-        if not path.is_file():
-            raise CheckpointError(f"there is no file '{path}' (onnx:FILE)")
-        data = path.read_bytes()
+        data = read_bytes(path, "policy", CheckpointError)
+        check_seal(data, path)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        try:
+        with reading("policy", path, "an ONNX file that can be run", CheckpointError):
             self._session = onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
-        except Exception as error:  # onnxruntime's exceptions share no other base
-            raise CheckpointError(f"'{path}' is not an ONNX file that can be run: {error}") from error
-        text = self._session.get_modelmeta().custom_metadata_map.get(CARD)
+            text = self._session.get_modelmeta().custom_metadata_map.get(CARD)
         if text is None:
             raise CheckpointError(f"'{path}' carries no card: write it by `wbc-bench export`")
-        self.card, self.sha256 = (
-            decode_card(text.encode(), str(path)),
-            hashlib.sha256(data).hexdigest(),
-        )
+        self.card, self.sha256 = decode_card(text.encode(), str(path)), hashlib.sha256(data).hexdigest()
         self.flow = flow_of(make_estimator(METHODS[self.card.method].estimator))
-        names = [value.name for value in self._session.get_inputs()]
-        if names != list(self.flow.inputs):
-            raise CheckpointError(
-                f"'{path}' reads {', '.join(names)}, {self.card.method}: {', '.join(self.flow.inputs)}"
-            )
+        self._check_flow(path)
+
+    def _check_flow(self, path: Path) -> None:
+        """Raises: CheckpointError, inputs or outputs are not those of the card's method."""
+        wanted = {name: ["tensor(float)", *shape] for name, shape in self.flow.inputs.items()}
+        found = {value.name: [value.type, *value.shape[1:]] for value in self._session.get_inputs()}
+        if found != wanted:
+            raise CheckpointError(f"'{path}' reads {found}, valid for {self.card.method}: {wanted}")
+        names, outputs = [value.name for value in self._session.get_outputs()], list(self.flow.outputs)
+        if names != [_output(name) for name in outputs]:
+            raise CheckpointError(f"'{path}' writes {names}, valid for {self.card.method}: {outputs}")
 
     def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
         """Compute one control step of N robots."""
         arrays = {name: np.ascontiguousarray(values[name].numpy()) for name in self.flow.inputs}
         found = self._session.run([_output(name) for name in self.flow.outputs], arrays)
         return {n: torch.from_numpy(np.asarray(v)) for n, v in zip(self.flow.outputs, found, strict=True)}
+
+
+def seal(data: bytes) -> bytes:
+    """The SHA-256 of a model as one more entry of its metadata, to be appended to its bytes.
+
+    A message of protocol buffers may be continued by further fields, so that the digest can cover all bytes
+    before it. Source: onnx.proto, ModelProto.metadata_props = 14, StringStringEntryProto.key = 1, value = 2.
+    """
+
+    def field(number: int, content: bytes) -> bytes:
+        assert len(content) < 128  # a length in one byte
+        return bytes([number << 3 | 2, len(content)]) + content
+
+    return field(14, field(1, DIGEST) + field(2, hashlib.sha256(data).hexdigest().encode()))
+
+
+def check_seal(data: bytes, path: Path) -> None:
+    """Check that a file ends in the digest of what stands before; it is not parsed otherwise.
+
+    Raises:
+        CheckpointError: There is no digest, or it is that of other bytes.
+    """
+    size = len(seal(b""))
+    model, end = data[:-size], data[-size:]
+    if end == seal(model):
+        return
+    if end[: -2 * hashlib.sha256().digest_size] != seal(b"")[: -2 * hashlib.sha256().digest_size]:
+        raise CheckpointError(
+            f"'{path}' is not an ONNX file that can be run here: it carries no card and digest at its end, so it "
+            "was cut short or not written by this version of `wbc-bench export`"
+        )
+    raise CheckpointError(
+        f"'{path}' is altered: SHA-256 {hashlib.sha256(model).hexdigest()[:12]} of {len(model)} bytes, "
+        f"it says {end[-64:-52].decode(errors='replace')}"
+    )
 
 
 def _output(name: str) -> str:

@@ -6,7 +6,7 @@ episodes pick from it.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
 from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.outcomes import STRATA
+from wbc_bench.readers import read_parquet
 from wbc_bench.robot import load_robot
 from wbc_bench.schema import meaning
 
@@ -133,16 +134,8 @@ def read_target_set(protocol: EvalProtocol, path: Path | None = None) -> TargetS
         raise ManifestError(
             f"target set '{path}' does not exist: make it with `wbc-train targets --protocol {protocol.name}`"
         )
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise ManifestError(f"target set '{path}' is not readable parquet: {error}") from error
-    made_for = (table.schema.metadata or {}).get(b"digest", b"").decode()
-    if table.column_names != list(TargetSet._fields):
-        raise ManifestError(
-            f"target set '{path}' has columns {', '.join(table.column_names)}, valid: "
-            f"{', '.join(TargetSet._fields)}: draw it again with `wbc-train targets`"
-        )
+    table = read_parquet(path, "target set", ManifestError, COLUMNS)
+    made_for = (table.schema.metadata or {}).get(b"digest", b"").decode(errors="replace")
     if made_for != digest(protocol):
         raise ManifestError(
             f"target set '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
@@ -152,6 +145,26 @@ def read_target_set(protocol: EvalProtocol, path: Path | None = None) -> TargetS
 
     def matrix(name: str) -> NDArray[np.float32]:
         column = table[name].combine_chunks()
-        return column.flatten().to_numpy().reshape(len(table), -1)
+        return column.flatten().to_numpy(zero_copy_only=False).reshape(len(table), _WIDTHS[name])
 
-    return TargetSet(table["stratum"].to_numpy(), *map(matrix, TargetSet._fields[1:]))
+    found = TargetSet(table["stratum"].to_numpy(), *map(matrix, _WIDTHS))
+    for problem in _mistakes(found):
+        raise ManifestError(f"target set '{path}': {problem}: draw it again with `wbc-train targets`")
+    return found
+
+
+_WIDTHS = {"pos_w": 3, "quat_w": 4, "witness_qpos": 21}
+COLUMNS = {"stratum": "int8"}
+COLUMNS |= {name: f"fixed_size_list<element: float>[{width}]" for name, width in _WIDTHS.items()}
+
+
+def _mistakes(found: TargetSet) -> Iterator[str]:
+    """What is wrong with the values of a target set."""
+    if len(found) == 0 or not ((found.stratum >= 0) & (found.stratum < len(STRATA))).all():
+        yield f"strata {np.unique(found.stratum).tolist()}, valid: 0 to {len(STRATA) - 1}"
+    for name in _WIDTHS:
+        if not np.isfinite(getattr(found, name)).all():
+            yield f"{name} holds a number that is not finite"
+    for quat in (found.quat_w, found.witness_qpos[:, 3:7]):
+        if not (np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-5).all():  # of float32
+            yield "the norm of a quaternion is not 1"

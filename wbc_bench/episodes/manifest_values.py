@@ -1,0 +1,128 @@
+"""What the values of a manifest must be: ones that its protocol can draw, in the units of their columns."""
+
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wbc_bench.episodes.kinds import kind_of
+from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.episodes.randomization import resting_height
+from wbc_bench.episodes.rows import EpisodeManifest
+from wbc_bench.episodes.targets import BEYOND
+from wbc_bench.robot import load_robot
+
+SAME = 1e-9  # [m, rad] another processor rounds differently
+UNIT = 1e-12  # of the norm of a quaternion
+_MAY_BE_NAN = ("push_time", "feasible_qpos")  # no push, no feasible pose
+_ZERO_IF_NOMINAL = ("base_mass", "base_vel", "leg_q", "leg_qd", "push_vel", "noise_scale")
+
+
+class Bound(NamedTuple):
+    """Values that all lie in a range."""
+
+    name: str
+    values: NDArray[np.float64]  # (N,) or (N, K)
+    low: ArrayLike
+    high: ArrayLike
+
+    @property
+    def inside(self) -> bool:
+        """Whether all that are defined lie in the range."""
+        known = np.isnan(self.values) | ((self.values >= self.low) & (self.values <= self.high))
+        return bool(known.all())
+
+    @property
+    def extent(self) -> str:
+        """Smallest and largest value."""
+        return f"{np.nanmin(self.values):.4g} to {np.nanmax(self.values):.4g}"
+
+
+def bounds(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Bound]:
+    """The ranges of all draws, without those of which no value is defined."""
+    spread, push = protocol.randomization, protocol.push
+    slide = load_robot(protocol.robot).facts.friction.slide
+    drawn = manifest.condition != "nominal"
+    noisy = manifest.take(np.flatnonzero(drawn))
+    quiet = manifest.take(np.flatnonzero(~drawn))
+    norm = np.linalg.norm(manifest.target_quat_w, axis=1)
+    velocity = np.array([spread.base_lin_vel] * 3 + [spread.base_ang_vel] * 3)
+    found = [
+        Bound("friction", noisy.friction, *spread.friction),
+        Bound("base_mass", noisy.base_mass, *spread.base_mass),
+        Bound("base_vel", noisy.base_vel, -velocity, velocity),
+        Bound("leg_q", noisy.leg_q, -spread.leg_q, spread.leg_q),
+        Bound("leg_qd", noisy.leg_qd, -spread.leg_qd, spread.leg_qd),
+        Bound("kp_scale", noisy.kp_scale, *spread.gain),
+        Bound("kd_scale", noisy.kd_scale, *spread.gain),
+        Bound("push_time", noisy.push_time, push.interval[0], protocol.episodes.horizon - push.quiet_end),
+        Bound("push_vel", noisy.push_vel, -push.speed, push.speed),
+        Bound("noise_scale", noisy.noise_scale, 1, 1),
+        Bound("target quaternion", norm, 1 - UNIT, 1 + UNIT),
+        Bound("nominal friction", quiet.friction, slide, slide),
+        *(Bound(f"nominal {name}", getattr(quiet, name), 0, 0) for name in _ZERO_IF_NOMINAL),
+        Bound("nominal kp_scale", quiet.kp_scale, 1, 1),
+        Bound("nominal kd_scale", quiet.kd_scale, 1, 1),
+    ]
+    return [bound for bound in found if bound.values.size and not np.isnan(bound.values).all()]
+
+
+def height_error(protocol: EvalProtocol, manifest: EpisodeManifest) -> float:
+    """Largest distance [m] of a base's height at reset from the one at which the soles touch the ground."""
+    heights = [resting_height(protocol.robot, leg_q) for leg_q in manifest.leg_q]
+    return float(np.abs(heights - manifest.base_height).max())
+
+
+def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
+    """What is wrong with the values of a manifest that has the protocol's columns and number of rows."""
+    size = protocol.episodes.per_replicate
+    for name, expected in (
+        ("replicate", np.repeat(np.arange(protocol.episodes.replicates), size)),
+        ("episode", np.tile(np.arange(size), protocol.episodes.replicates)),
+    ):
+        if not np.array_equal(getattr(manifest, name), expected):
+            yield f"{name} does not count the rows, valid: replicate by replicate, episodes from 0"
+            return  # the other checks name episodes
+    for field in fields(manifest):
+        value = getattr(manifest, field.name)
+        if value.dtype.kind == "f" and field.name not in _MAY_BE_NAN and not np.isfinite(value).all():
+            yield f"{field.name} holds a number that is not finite"
+            return
+    yield from kind_of(protocol).count_mistakes(protocol, manifest)
+    yield from kind_of(protocol).target_mistakes(protocol, manifest)
+    for bound in bounds(protocol, manifest):
+        if not bound.inside:
+            low, high = (f"{np.ravel(edge)[0]:g}" for edge in (bound.low, bound.high))
+            yield f"{bound.name} is {bound.extent}, valid: {low} to {high}"
+    if (manifest.noise_key < 0).any():
+        yield f"noise_key is {manifest.noise_key.min()}, valid: 0 or more"
+    yield from _push_mistakes(protocol, manifest)
+    yield from _pose_mistakes(manifest)
+    if not (off := height_error(protocol, manifest)) < SAME:
+        yield f"base_height is up to {off:.3g} m off the one at which the soles touch the ground"
+
+
+def _push_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
+    time = manifest.push_time
+    none = np.isnan(time)
+    if not none.all() and protocol.push.speed == 0:
+        yield "push_time holds pushes, and the protocol has none"
+    if not none[manifest.condition == "nominal"].all():
+        yield "push_time holds pushes of nominal episodes, valid: none"
+    if (manifest.push_vel[np.repeat(none, 2, axis=1)] != 0).any():
+        yield "push_vel holds velocities without a time, valid: 0"
+    if (np.diff(time, axis=1) <= 0).any() or (none[:, :-1] & ~none[:, 1:]).any():
+        yield "push_time does not rise within an episode"
+
+
+def _pose_mistakes(manifest: EpisodeManifest) -> Iterator[str]:
+    qpos = manifest.feasible_qpos
+    beyond = manifest.stratum == BEYOND
+    if not np.isnan(qpos[beyond]).all():
+        yield f"feasible_qpos of targets '{BEYOND}' has numbers, valid: NaN"
+    if not np.isfinite(qpos[~beyond]).all():
+        yield "feasible_qpos holds a number that is not finite"
+    elif (np.abs(np.linalg.norm(qpos[~beyond, 3:7], axis=1) - 1) > UNIT).any():
+        yield "feasible_qpos has a quaternion whose norm is not 1"
