@@ -5,6 +5,7 @@ passes through `reading`, so no reader has to know the exceptions of the librari
 """
 
 import contextlib
+import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -52,6 +53,11 @@ def reading(kind: str, path: Path | str, valid: str, error: type[BenchError]) ->
         if not valid:
             raise error(f"{kind} {path}: {text}") from cause
         raise error(f"{kind} '{path}' is damaged or not {valid}, it cannot be read: {text}") from cause
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file is there; False also for a name that no file can have, where `Path` raises."""
+    return os.path.isfile(path)  # noqa: PTH113
 
 
 def read_bytes(path: Path, kind: str, error: type[BenchError]) -> bytes:
@@ -174,7 +180,7 @@ def check_columns(
         raise error(f"{kind} '{path}' has two columns of one name, valid: each once")
     for name, wanted in columns.items():
         if name not in names:
-            raise error(f"{kind} '{path}' has no column {name}, valid: {', '.join(columns)}")
+            raise error(f"{kind} '{path}' has columns {', '.join(names)}, valid: {', '.join(columns)}")
         found = str(table.schema.field(name).type).removeprefix("large_")
         if found != wanted:
             raise error(f"{kind} '{path}': column {name} is of type {found}, valid: {wanted}")

@@ -14,6 +14,7 @@ import msgspec
 
 from wbc_bench.errors import StoreError
 from wbc_bench.outcomes import SuccessRule
+from wbc_bench.readers import read_bytes, read_json, read_text
 from wbc_bench.results import gallery
 from wbc_bench.results.analysis import Evaluated, rule_of
 from wbc_bench.results.formatting import window_text
@@ -84,7 +85,7 @@ REACH_CAPTION = (
 def figure_html(path: Path, caption: str) -> str:
     """An image as an <img> with its bytes inside; separate images, so that ids of two SVGs cannot meet."""
     kind = {".svg": "svg+xml", ".png": "png"}[path.suffix]
-    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    data = base64.b64encode(read_bytes(path, "figure", StoreError)).decode("ascii")
     return (
         f'<figure><img alt="{html.escape(path.stem)}" src="data:image/{kind};base64,{data}">'
         f"<figcaption>{html.escape(caption)} <code>{html.escape(path.stem)}</code></figcaption></figure>\n"
@@ -97,13 +98,10 @@ def given_caption(figure: Path) -> str:
     Raises: StoreError, a sidecar that cannot be read.
     """
     text, facts = figure.with_suffix(".txt"), figure.with_suffix(".json")
-    try:
-        if text.exists():
-            return text.read_text(encoding="utf-8").strip()
-        if facts.exists():
-            return msgspec.json.decode(facts.read_bytes(), type=_Sidecar).caption
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise StoreError(f"caption of '{figure.name}': cannot read its .txt or .json: {error}") from error
+    if text.exists():
+        return read_text(text, f"caption of '{figure.name}'", StoreError).strip()
+    if facts.exists():
+        return read_json(facts, _Sidecar, f"caption of '{figure.name}'", StoreError).caption
     return ""
 
 

@@ -23,7 +23,7 @@ import pyarrow as pa
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import folder_name
 from wbc_bench.outcomes import Outcome, SuccessRule
-from wbc_bench.readers import decode_parquet, read_bytes, read_json
+from wbc_bench.readers import decode_parquet, is_file, read_bytes, read_json
 from wbc_bench.results.records import refuse_values
 
 KEYS = {"episode": "int64", "outcome": "string"}  # columns of every file of episodes
@@ -177,7 +177,7 @@ class ResultStore:
         Raises: UnknownNameError (with the nearest names), StoreError.
         """
         for folder in (Path(name), self.root / "runs" / name):
-            if (folder / "run.json").exists():
+            if is_file(folder / "run.json"):
                 return Run(folder, read_run_record(folder / "run.json"))
         known = [str(run.path.relative_to(self.root / "runs")) for run in self.runs()]
         raise UnknownNameError("run", name, known, f"a folder, or below '{self.root / 'runs'}'")

@@ -12,6 +12,9 @@ import pandas as pd
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from wbc_bench.errors import StoreError
+from wbc_bench.readers import read_text
+
 LONG = 30  # rows beyond which a page shows a table on demand only
 
 
@@ -175,9 +178,14 @@ class _Terminal:
 
 
 def read_markdown(path: Path) -> Table:
-    """The table that `Table.write` wrote as Markdown, without its frame."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    """The table that `Table.write` wrote as Markdown, without its frame.
+
+    Raises: StoreError when the file cannot be read or has no table.
+    """
+    lines = read_text(path, "table", StoreError).splitlines()
     cells = [tuple(c.strip() for c in line.strip("|").split("|")) for line in lines if line.startswith("|")]
+    if len(cells) < 2 or len({len(row) for row in cells}) > 1:
+        raise StoreError(f"table '{path}' is damaged, valid: rows of one length, a header first")
     title = next((line.removeprefix("## ") for line in lines if line.startswith("## ")), path.stem)
     notes = tuple(line.removeprefix("- ") for line in lines if line.startswith("- "))
     return Table(path.stem, title, cells[0], tuple(cells[2:]), notes)

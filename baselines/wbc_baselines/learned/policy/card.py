@@ -5,7 +5,6 @@ limits, default posture or end-effector frame of the robot differ from those of 
 """
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench import provenance
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, UnknownNameError
-from wbc_bench.readers import decode_json, read_bytes
+from wbc_bench.readers import decode_json, is_file, read_bytes
 from wbc_bench.robot import JOINT_NAMES, Robot, load_robot, mount_of, tcp_of, without_sources
 from wbc_bench.schema import meaning
 
@@ -188,7 +187,7 @@ def read_card(path: Path) -> PolicyCard:
     """
     beside = card_path(path)
     for file in (path, beside):
-        if not os.path.isfile(file):  # noqa: PTH113  (false for a name that is too long, where Path raises)
+        if not is_file(file):
             raise CheckpointError(f"checkpoint '{path}': there is no file '{file}'")
     return decode_card(read_bytes(beside, "checkpoint card", CheckpointError), str(beside))
 

@@ -16,7 +16,7 @@ from wbc_baselines.learned.policy.networks import Actor
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.files import write_atomic
-from wbc_bench.readers import read_bytes
+from wbc_bench.readers import is_file, read_bytes
 from wbc_bench.robot import Robot, load_robot
 from wbc_bench.tensors import decode_tensors
 
@@ -168,7 +168,7 @@ def find(name: str) -> Path:
     if name.endswith(".safetensors"):
         return Path(name)
     path = CHECKPOINTS / f"{name}.safetensors"
-    if not path.is_file():
+    if not is_file(path):
         known = available()
         method = name.partition("@")[0]
         if method not in METHODS:

@@ -12,7 +12,7 @@ from wbc_baselines.learned.policy.card import CheckpointError, decode_card
 from wbc_baselines.learned.policy.estimators import make_estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.policy import flow_of
-from wbc_bench.readers import read_bytes, reading
+from wbc_bench.readers import is_file, read_bytes, reading
 
 OPSET = 17
 CARD, DIGEST = "card", b"sha256"  # keys of the metadata
@@ -30,6 +30,8 @@ class OnnxEngine:
         Raises:
             CheckpointError: The file is missing, damaged, or was not exported by this package.
         """
+        if not is_file(path):
+            raise CheckpointError(f"there is no file '{path}' (onnx:FILE)")
         data = read_bytes(path, "policy", CheckpointError)
         check_seal(data, path)
         options = onnxruntime.SessionOptions()
@@ -81,18 +83,18 @@ def check_seal(data: bytes, path: Path) -> None:
     Raises:
         CheckpointError: There is no digest, or it is that of other bytes.
     """
-    size = len(seal(b""))
+    size, digits = len(seal(b"")), 64
     model, end = data[:-size], data[-size:]
     if end == seal(model):
         return
-    if end[: -2 * hashlib.sha256().digest_size] != seal(b"")[: -2 * hashlib.sha256().digest_size]:
+    if end[:-digits] != seal(b"")[:-digits]:
         raise CheckpointError(
-            f"'{path}' is not an ONNX file that can be run here: it carries no card and digest at its end, so it "
-            "was cut short or not written by this version of `wbc-bench export`"
+            f"'{path}' is not an ONNX file that can be run here: it carries no card and digest at its end, "
+            "so it was cut short or not written by this version of `wbc-bench export`"
         )
     raise CheckpointError(
         f"'{path}' is altered: SHA-256 {hashlib.sha256(model).hexdigest()[:12]} of {len(model)} bytes, "
-        f"it says {end[-64:-52].decode(errors='replace')}"
+        f"it says {end[-digits:][:12].decode(errors='replace')}"
     )
 
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.training.config import TrainConfig
-from wbc_baselines.learned.training.run_folder import RunFolder, run
+from wbc_baselines.learned.training.run_folder import RunFolder, run, run_folders
 
 Progress = Callable[[int, int, str], None]
 
@@ -67,16 +66,14 @@ def campaign(configs: Sequence[TrainConfig], out: Path, progress: Progress) -> I
 
 def is_done(folder: RunFolder, config: TrainConfig) -> bool:
     """Return whether the run has been finished with this budget or a larger one."""
-    import json
-
-    return folder.finished.exists() and json.loads(folder.finished.read_text())["samples"] >= config.budget
+    samples = folder.samples_when_finished()
+    return samples is not None and samples >= config.budget
 
 
 def standing(out: Path) -> list[Standing]:
     """List the progress of all runs below a folder, ordered by method."""
     found = []
-    for path in sorted(out.glob("*@*/config.json")):
-        folder = RunFolder(path.parent)
+    for folder in run_folders(out, "config.json"):
         rows = folder.read_metrics()
         last = rows[-1] if rows else {}
         if folder.finished.exists():
@@ -90,10 +87,9 @@ def standing(out: Path) -> list[Standing]:
                 folder.path.name,
                 state,
                 last.get("samples", 0),
-                last.get("seconds", 0.0),
+                last.get("seconds") or 0.0,
                 last.get("episode/success"),
                 last.get("episode/falls"),
             )
         )
-    order = list(METHODS)
-    return sorted(found, key=lambda s: (order.index(s.name.split("@")[0]), s.name))
+    return found

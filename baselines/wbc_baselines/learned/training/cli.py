@@ -129,12 +129,12 @@ class Gates:
 
     def run(self) -> None:
         from wbc_baselines.learned.training.curves import measured_scores
-        from wbc_baselines.learned.training.run_folder import RunFolder
+        from wbc_baselines.learned.training.run_folder import run_folders
 
-        for path in sorted(self.out.glob("*@*/metrics.jsonl")):
-            if rows := RunFolder(path.parent).read_metrics():
+        for folder in run_folders(self.out, "metrics.jsonl"):
+            if rows := folder.read_metrics():
                 phase, score_m, score_l = measured_scores(rows)
-                print(f"{path.parent.name}: PHASE {phase:.4f}, SCORE_M {score_m:.3f}, SCORE_L {score_l:.3f}")
+                print(f"{folder.path.name}: PHASE {phase:.4f}, SCORE_M {score_m:.3f}, SCORE_L {score_l:.3f}")
 
 
 @dataclass(frozen=True)

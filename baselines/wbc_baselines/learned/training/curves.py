@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.training.run_folder import RunFolder
+from wbc_baselines.learned.training.config import TrainingError
+from wbc_baselines.learned.training.run_folder import run_folders
 from wbc_bench.results.figures.style import DASHES, METHOD_COLOURS, STYLE, save
 
 Rows = list[dict]
@@ -32,7 +33,7 @@ def smooth(rows: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Control steps (K,) and means (K,) of the iterations that have the metric.
     """
-    chosen = [row for row in rows if row.get(metric) is not None]
+    chosen = [row for row in rows if None not in (row.get(metric), row.get("episode/count"))]
     x = np.array([row["samples"] for row in chosen], dtype=float)
     y = np.array([row[metric] for row in chosen], dtype=float)
     weight = np.array([max(row["episode/count"], 1e-9) for row in chosen], dtype=float)
@@ -84,7 +85,14 @@ def measured_scores(rows: Rows, part: float = 0.1) -> tuple[float, float, float]
 
     Returns:
         PHASE, SCORE_M and SCORE_L.
+
+    Raises:
+        TrainingError: There is no row with all gates.
     """
+    gates = ("phase", "manipulation", "reference")
+    rows = [row for row in rows if None not in [row.get(f"gate/{gate}") for gate in gates]]
+    if not rows:
+        raise TrainingError("no iteration has the metrics " + ", ".join(f"gate/{gate}" for gate in gates))
     last = rows[-max(1, round(part * len(rows))) :]
 
     def mean(gate: str) -> float:
@@ -105,12 +113,7 @@ def write_curves(out: Path, figures: Path, name: str = "learning_curves") -> lis
     Returns:
         The PNG and the SVG file; nothing if there is no run.
     """
-    order = list(METHODS)
-    folders = sorted(
-        (path.parent for path in out.glob("*@*/metrics.jsonl")),
-        key=lambda p: (order.index(p.name.split("@")[0]), p.name),
-    )
-    runs = [(folder.name, RunFolder(folder).read_metrics()) for folder in folders]
+    runs = [(folder.path.name, folder.read_metrics()) for folder in run_folders(out, "metrics.jsonl")]
     if not runs:
         return []
     with style.context(["default", str(STYLE)]):

@@ -1,5 +1,6 @@
 """The folder of a training run: configuration, metrics, resume file, checkpoint. Every write is atomic."""
 
+import io
 import json
 import os
 import signal
@@ -9,16 +10,26 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import msgspec
+
+from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_bench.files import write_atomic
+from wbc_bench.readers import read_bytes, read_json, read_text, reading
 
 if TYPE_CHECKING:
     from wbc_baselines.learned.training.trainer import Trainer
 
 CHECKPOINT_PERIOD = 90.0  # [s] between resume files, the most that is lost when a run is killed
 STALE = 900.0  # [s] without an update after which a claim may be taken over
+
+
+class _Finished(msgspec.Struct):
+    """What is read of the note that a run leaves when it is finished."""
+
+    samples: int
 
 
 @dataclass(frozen=True)
@@ -74,12 +85,7 @@ class RunFolder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         if self.config.exists():
-            try:
-                before = json.loads(self.config.read_text())
-            except ValueError as error:
-                raise TrainingError(
-                    f"configuration '{self.config}' is damaged ({error}): give another --out"
-                ) from error
+            before = read_json(self.config, dict[str, Any], "configuration", TrainingError)
             changed = config.changes(before)
             fixed = ("method", "seed", "protocol")  # what the run is called and judged by
             wrong = {n: c for n, c in changed.items() if not change or n in fixed}
@@ -97,19 +103,38 @@ class RunFolder:
         write_atomic(self.config, json.dumps(asdict(config), indent=2).encode())
 
     def read_metrics(self) -> list[dict]:
-        """Read the metrics of all iterations; a line that was cut short by a kill is left out."""
+        """Read the metrics of all iterations.
+
+        A line that was cut short by a kill, or is otherwise not a row, is left out.
+
+        Raises:
+            TrainingError: The file cannot be read.
+        """
         if not self.metrics.exists():
             return []
         rows: list[dict] = []
-        for line in self.metrics.read_text().splitlines():
+        for line in read_bytes(self.metrics, "metrics", TrainingError).splitlines():
             try:
-                row = json.loads(line)
-            except json.JSONDecodeError:
+                row = msgspec.json.decode(line, type=dict[str, float | None])
+                iteration, samples = row["iteration"], row["samples"]
+            except (ValueError, KeyError, RecursionError):
                 continue
-            while rows and rows[-1]["iteration"] >= row["iteration"]:
+            if iteration is None or samples is None:
+                continue
+            while rows and rows[-1]["iteration"] >= iteration:
                 rows.pop()  # lost in a kill, and trained again
-            rows.append(row)
+            rows.append(row | {"iteration": int(iteration), "samples": int(samples)})
         return rows
+
+    def samples_when_finished(self) -> int | None:
+        """Return the control steps of a finished run; None if it is not finished.
+
+        Raises:
+            TrainingError: The file cannot be read.
+        """
+        if not self.finished.exists():
+            return None
+        return read_json(self.finished, _Finished, "note of a finished run", TrainingError).samples
 
     def append(self, row: dict) -> None:
         """Append the metrics of one iteration."""
@@ -141,11 +166,15 @@ class RunFolder:
 
     def _is_dead(self) -> bool:
         """Whether the claim belongs to a process of this machine that has ended."""
-        host, pid, started, *_ = [*self.claim.read_text().split(), "", "", ""]
+        host, pid, started, *_ = [*read_text(self.claim, "claim", TrainingError).split(), "", "", ""]
         if host != socket.gethostname() or not pid.isdigit():
             return False
         running = _start_of(pid)
         return not running or (bool(started) and running != started)
+
+    def owner(self) -> str:
+        """Return host and process of the claim."""
+        return " ".join(read_text(self.claim, "claim", TrainingError).split())
 
     def touch(self) -> None:
         """Update the time of the claim, so that it is not taken over."""
@@ -156,6 +185,17 @@ class RunFolder:
         self.claim.unlink(missing_ok=True)
 
 
+def run_folders(out: Path, file: str) -> list[RunFolder]:
+    """List the runs below a folder that have a file, ordered by method; a run's name is METHOD@SEED."""
+    order = list(METHODS)
+    found = []
+    for path in out.glob(f"*@*/{file}"):
+        method, _, seed = path.parent.name.partition("@")
+        if method in METHODS and seed.isascii() and seed.isdigit():
+            found.append((order.index(method), path.parent.name, RunFolder(path.parent)))
+    return [folder for _, _, folder in sorted(found, key=lambda one: one[:2])]
+
+
 def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
     """Write the checkpoint and the resume file.
 
@@ -164,8 +204,6 @@ def save_resume(trainer: "Trainer", folder: RunFolder, seconds: float) -> None:
         folder: Folder of its run.
         seconds: Training time so far [s].
     """
-    import io
-
     import torch
 
     trainer.write_checkpoint(folder.checkpoint, seconds)
@@ -187,25 +225,23 @@ def load_resume(trainer: "Trainer", folder: RunFolder) -> float:
     Raises:
         TrainingError: The file cannot be read, or was written by another version of the code.
     """
-    import pickle
-    import zipfile
-
     import torch
 
     if not folder.resume.exists():
         return 0.0
-    try:
-        saved = torch.load(folder.resume, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
-        raise TrainingError(f"resume file '{folder.resume}' cannot be read: {error}") from error
+    data = io.BytesIO(read_bytes(folder.resume, "resume file", TrainingError))
+    with reading("resume file", folder.resume, "a resume file of this version", TrainingError):
+        saved = torch.load(data, map_location="cpu", weights_only=True)
+        seconds = float(saved["seconds"])
     try:
         trainer.load(saved)
-    except (KeyError, TypeError) as error:  # a field too few or too many
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
+        text = " ".join(str(error).split())  # a field too few or too many, or of another shape
         raise TrainingError(
-            f"resume file '{folder.resume}' is of another version of the code ({error}); valid: the version "
+            f"resume file '{folder.resume}' is of another version of the code ({text}); valid: the version "
             "that wrote it, or another --out with --init-checkpoint at the run's checkpoint"
         ) from error
-    return saved["seconds"]
+    return seconds
 
 
 def run(
@@ -233,7 +269,7 @@ def run(
 
     config.check()
     if not folder.take():
-        raise TrainingError(f"run '{folder.path}' is being trained by {folder.claim.read_text()}")
+        raise TrainingError(f"run '{folder.path}' is being trained by {folder.owner()}")
     try:
         folder.open(config, change)
         trainer = Trainer(config, make_environment(config))
