@@ -9,6 +9,10 @@ from pathlib import Path
 class BenchError(Exception):
     """A mistake in the input; the command line prints it in one line and exits with code 2."""
 
+    def __str__(self) -> str:
+        """One line, also where a name from a file holds line breaks or control characters."""
+        return "".join(c if c.isprintable() else " " for c in super().__str__())
+
 
 class UnknownNameError(BenchError):
     """A name that is not in a list of valid ones, with the nearest of them."""

@@ -44,9 +44,9 @@ def reading(kind: str, path: Path | str, valid: str, error: type[BenchError]) ->
         raise
     except FileNotFoundError as cause:
         raise error(f"{kind} '{path}' does not exist") from cause
-    except OSError as cause:
-        raise error(f"{kind} '{path}' cannot be read: {cause.strerror or cause}") from cause
     except Exception as cause:  # decoders of other projects raise what they like
+        if isinstance(cause, OSError) and cause.strerror:  # pyarrow's own have none
+            raise error(f"{kind} '{path}' cannot be read: {cause.strerror}") from cause
         text = " ".join(str(cause).split())[:500] or type(cause).__name__
         if isinstance(cause, RecursionError):
             text = "it is nested too deeply"
@@ -180,7 +180,7 @@ def check_columns(
         raise error(f"{kind} '{path}' has two columns of one name, valid: each once")
     for name, wanted in columns.items():
         if name not in names:
-            raise error(f"{kind} '{path}' has columns {', '.join(names)}, valid: {', '.join(columns)}")
+            raise error(f"{kind} '{path}' has columns {', '.join(names)[:500]}, valid: {', '.join(columns)}")
         found = str(table.schema.field(name).type).removeprefix("large_")
         if found != wanted:
             raise error(f"{kind} '{path}': column {name} is of type {found}, valid: {wanted}")

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wbc_bench.errors import StoreError
-from wbc_bench.outcomes import STRATA, TERMINATED, SuccessRule
+from wbc_bench.outcomes import STRATA, TERMINATED, Outcome, SuccessRule
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -107,11 +107,43 @@ def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) ->
         spec: Evaluated(
             spec,
             tuple(run.record for run in group),
-            pd.concat([run.episodes() for run in group], ignore_index=True),
+            pd.concat([_episodes(run) for run in group], ignore_index=True),
             (labels or {}).get(spec, ""),
         )
         for spec, group in grouped.items()
     }
+
+
+TEXTS = ("stratum", "condition", "orientation", "outcome")  # columns of every file of episodes
+FINITE = ("replicate", "episode", "height", "target_x", "target_y", "success")
+NUMBERS = ("position_error", "orientation_error", "action_variation", "ee_speed_rms", "ee_sparc", "duration")
+
+
+def _episodes(run: RunLike) -> pd.DataFrame:
+    """Episodes of a run, with every column that tables and figures are made of.
+
+    Raises: StoreError when one is missing, of another type, or contradicts the record.
+    """
+    episodes, record = run.episodes(), run.record
+    where = f"episodes of {record.protocol}/{record.controller}/replicate_{record.replicate}"
+    for name in (*TEXTS, *FINITE, *NUMBERS):
+        if name not in episodes:
+            raise StoreError(
+                f"{where} have no column {name}, valid: {', '.join((*TEXTS, *FINITE, *NUMBERS))}"
+            )
+        values = episodes[name]
+        if name in TEXTS:
+            if values.isna().any() or not values.map(lambda value: isinstance(value, str)).all():
+                raise StoreError(f"{where}: column {name} holds {values.dtype}, valid: text in every row")
+        elif values.dtype.kind not in "iuf":
+            raise StoreError(f"{where}: column {name} holds {values.dtype}, valid: numbers")
+        elif name in FINITE and not np.isfinite(column(episodes, name)).all():
+            raise StoreError(f"{where}: column {name} holds a number that is not finite")
+    if not (column(episodes, "replicate") == record.replicate).all():
+        raise StoreError(f"{where}: column replicate holds others, valid: {record.replicate} in every row")
+    if not np.array_equal(episodes["success"] == 1, episodes["outcome"] == Outcome.SUCCESS):
+        raise StoreError(f"{where}: column success contradicts outcome, valid: 1 where it is a success")
+    return episodes
 
 
 def _refuse_two_versions(records: Sequence[Any]) -> None:

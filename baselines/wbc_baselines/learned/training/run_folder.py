@@ -85,8 +85,7 @@ class RunFolder:
         """
         self.path.mkdir(parents=True, exist_ok=True)
         if self.config.exists():
-            before = read_json(self.config, dict[str, Any], "configuration", TrainingError)
-            changed = config.changes(before)
+            changed = config.changes(self.settings())
             fixed = ("method", "seed", "protocol")  # what the run is called and judged by
             wrong = {n: c for n, c in changed.items() if not change or n in fixed}
             if wrong:
@@ -101,6 +100,10 @@ class RunFolder:
                 row = {"samples": rows[-1]["samples"] if rows else 0, "changed": changed}
                 _append(self.changes, row)
         write_atomic(self.config, json.dumps(asdict(config), indent=2).encode())
+
+    def settings(self) -> dict[str, Any]:
+        """Read the settings that the run was started with. Raises: TrainingError, the file is damaged."""
+        return read_json(self.config, dict[str, Any], "configuration", TrainingError)
 
     def read_metrics(self) -> list[dict]:
         """Read the metrics of all iterations.
