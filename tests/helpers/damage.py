@@ -139,7 +139,7 @@ def json_value(rng: Rng, data: bytes) -> bytes:
     """A value somewhere in the tree replaced, removed, or joined by another."""
     try:
         tree = json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return data
     places: list[tuple[Any, Any]] = []
 
@@ -280,7 +280,7 @@ def tensors(rng: Rng, data: bytes) -> bytes:
     try:
         found, size = load(data), int.from_bytes(data[:8], "little")
         metadata = json.loads(data[8 : 8 + size]).get("__metadata__")
-    except (SafetensorError, ValueError):
+    except (SafetensorError, ValueError, RecursionError):
         return data
     name = sorted(found)[rng.integers(len(found))]
     how, value = rng.integers(6), found[name]

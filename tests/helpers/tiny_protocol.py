@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, neutral, write_manifest
-from wbc_bench.episodes.protocol import MAX_PUSHES, read_protocol
-from wbc_bench.episodes.randomization import resting_height
-from wbc_bench.robot import RobotConfig
+from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, write_manifest
+from wbc_bench.episodes.protocol import EvalProtocol, read_protocol
+from wbc_bench.episodes.randomization import EpisodeDraws, sample
 
 TOML = """
 name = "tiny"
@@ -46,12 +45,12 @@ window = 0.1
 """
 
 
-def manifest(replicates: int, episodes: int) -> EpisodeManifest:
-    """Targets on a line, friction and speeds drawn: enough that no two episodes are alike."""
+def manifest(protocol: EvalProtocol) -> EpisodeManifest:
+    """Targets on a line, and the draws of the protocol: enough that no two episodes are alike."""
+    replicates, episodes = protocol.episodes.replicates, protocol.episodes.per_replicate
     count = replicates * episodes
-    rng = np.random.default_rng(0)
+    draws = zip(*(sample(protocol, k, i) for k in range(replicates) for i in range(episodes)), strict=True)
     return EpisodeManifest(
-        **neutral(count),
         replicate=np.repeat(np.arange(replicates), episodes),
         episode=np.tile(np.arange(episodes), replicates),
         stratum=np.full(count, "arm", dtype=object),
@@ -61,18 +60,7 @@ def manifest(replicates: int, episodes: int) -> EpisodeManifest:
         target_pos_w=np.column_stack([np.linspace(0.2, 0.6, count), np.zeros(count), np.full(count, 0.9)]),
         target_quat_w=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
         feasible_qpos=np.tile([0.0, 0.0, 0.85, 1.0, *[0.0] * 17], (count, 1)),
-        base_height=np.full(count, resting_height(RobotConfig(), np.zeros(8))),
-        friction=rng.uniform(0.5, 1.0, count),
-        base_mass=rng.uniform(0.0, 1.0, count),
-        base_vel=rng.uniform(-0.1, 0.1, (count, 6)),
-        leg_q=np.zeros((count, 8)),
-        leg_qd=np.zeros((count, 8)),
-        kp_scale=np.ones((count, 14)),
-        kd_scale=np.ones((count, 14)),
-        push_time=np.full((count, MAX_PUSHES), np.nan),
-        push_vel=np.zeros((count, 2 * MAX_PUSHES)),
-        noise_key=np.arange(count),
-        noise_scale=np.ones(count),
+        **{name: np.array(values) for name, values in zip(EpisodeDraws._fields, draws, strict=True)},
     )
 
 
@@ -81,7 +69,8 @@ def write_tiny(folder: Path, replicates: int = 2, episodes: int = 6, horizon: fl
     path = folder / "tiny.toml"
     path.write_text(TOML.format(replicates=replicates, episodes=episodes, horizon=horizon))
     frozen = manifest_path(path)
-    write_manifest(manifest(replicates, episodes), read_protocol(path), frozen)
+    protocol = read_protocol(path)
+    write_manifest(manifest(protocol), protocol, frozen)
     sha256 = hashlib.sha256(frozen.read_bytes()).hexdigest()
     frozen.with_suffix(".sha256").write_text(f"{sha256}  {frozen.name}\n")
     return path

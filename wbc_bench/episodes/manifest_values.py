@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.episodes.randomization import resting_height
+from wbc_bench.episodes.randomization import EpisodeDraws, nominal, resting_height, sample
 from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import BEYOND
 from wbc_bench.robot import load_robot
@@ -100,8 +100,7 @@ def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]
         yield f"noise_key is {manifest.noise_key.min()}, valid: 0 or more"
     yield from _push_mistakes(protocol, manifest)
     yield from _pose_mistakes(manifest)
-    if not (off := height_error(protocol, manifest)) < SAME:
-        yield f"base_height is up to {off:.3g} m off the one at which the soles touch the ground"
+    yield from _draw_mistakes(protocol, manifest)
 
 
 def _push_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
@@ -126,3 +125,15 @@ def _pose_mistakes(manifest: EpisodeManifest) -> Iterator[str]:
         yield "feasible_qpos holds a number that is not finite"
     elif (np.abs(np.linalg.norm(qpos[~beyond, 3:7], axis=1) - 1) > UNIT).any():
         yield "feasible_qpos has a quaternion whose norm is not 1"
+
+
+def _draw_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
+    """Columns that are not what the protocol's seed draws: a wrong unit may lie in the range."""
+    rows = zip(manifest.replicate.tolist(), manifest.episode.tolist(), manifest.condition, strict=True)
+    drawn = [(nominal if kind == "nominal" else sample)(protocol, k, i) for k, i, kind in rows]
+    for name, values in zip(EpisodeDraws._fields, zip(*drawn, strict=True), strict=True):
+        off = ~np.isclose(getattr(manifest, name), np.array(values), rtol=0, atol=SAME, equal_nan=True)
+        if off.any():
+            i = int(off.reshape(len(manifest), -1).any(axis=1).argmax())
+            place = f"{manifest.replicate[i]}/{manifest.episode[i]}"
+            yield f"{name} of episode {place} is not what the protocol's seed draws"

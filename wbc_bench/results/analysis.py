@@ -137,6 +137,8 @@ def _episodes(run: RunLike) -> pd.DataFrame:
                 raise StoreError(f"{where}: column {name} holds {values.dtype}, valid: text in every row")
         elif values.dtype.kind not in "iuf":
             raise StoreError(f"{where}: column {name} holds {values.dtype}, valid: numbers")
+        elif np.isinf(column(episodes, name)).any():
+            raise StoreError(f"{where}: column {name} holds an infinite number")
         elif name in FINITE and not np.isfinite(column(episodes, name)).all():
             raise StoreError(f"{where}: column {name} holds a number that is not finite")
     if not (column(episodes, "replicate") == record.replicate).all():

@@ -15,7 +15,14 @@ import pyarrow as pa
 from wbc_bench.outcomes import TERMINATED
 from wbc_bench.results import stats
 from wbc_bench.results.formatting import DEG, names_note, number_text
-from wbc_bench.results.records import driven_folder, parquet_of, read_record, refuse_values, write_record
+from wbc_bench.results.records import (
+    driven_folder,
+    not_finite,
+    parquet_of,
+    read_record,
+    refuse_values,
+    write_record,
+)
 from wbc_bench.results.table import Table
 from wbc_bench.results.tracking import STOOD
 
@@ -87,6 +94,7 @@ def _read(path: Path) -> DoorRun:
     record, table = read_record(path, DoorRecord, beside, "episodes_sha256", COLUMNS)
     run = DoorRun(record, table.to_pandas())
     refuse_values(path, _mistakes(run))
+    refuse_values(beside, not_finite(run.episodes, ("x", "y", "z", "yaw", "angle", "final_angle")))
     return run
 
 

@@ -1,11 +1,13 @@
 """A run as two files: its data as parquet, and a JSON record of what was run."""
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 import msgspec
+import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -27,6 +29,7 @@ class Driven(Protocol):
     def seed(self) -> int: ...
 
 
+LARGEST = 1e6  # [m, rad, s] of what is measured in an episode
 Record = TypeVar("Record", bound=msgspec.Struct)
 
 
@@ -83,3 +86,11 @@ def refuse_values(path: Path, mistakes: Iterable[tuple[str, object, str]]) -> No
     """Refuse the first of (name, value, what is valid). Raises: StoreError, there is one."""
     for name, value, valid in mistakes:
         raise StoreError(f"record '{path}': {name} is {value}, valid: {valid}")
+
+
+def not_finite(frame: pd.DataFrame, columns: Iterable[str]) -> Iterator[tuple[str, object, str]]:
+    """Columns with a number that no meter, radian or second of an episode is, for `refuse_values`."""
+    for name in columns:
+        values = np.asarray(frame[name], dtype=np.float64)
+        if not (np.abs(values) <= LARGEST).all():
+            yield f"column {name}", f"{values.min():g} to {values.max():g}", f"numbers up to {LARGEST:g}"

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from wbc_bench.outcomes import TERMINATED
 from wbc_bench.results.formatting import CM, DEG, NONE, names_note, number_text
 from wbc_bench.results.metrics import spectral_arc_length
-from wbc_bench.results.records import driven_folder, parquet_of, read_record, refuse_values, write_record
+from wbc_bench.results.records import (
+    driven_folder,
+    not_finite,
+    parquet_of,
+    read_record,
+    refuse_values,
+    write_record,
+)
 from wbc_bench.results.table import Table
 from wbc_bench.rotations import geodesic_angle
 
@@ -217,6 +224,7 @@ def _read(path: Path) -> Track:
     record, series = read_record(path, TrackRecord, beside, "series_sha256", SERIES)
     refuse_values(path, _mistakes(record, len(series)))
     frame = series.to_pandas()
+    refuse_values(beside, not_finite(frame, SERIES))
 
     def columns(*names: str) -> Array:
         return frame[list(names)].to_numpy(dtype=float)
