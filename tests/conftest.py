@@ -27,6 +27,6 @@ def calm_rows(smoke: EvalProtocol) -> CalmRows:
     def rows(count: int, **columns: np.ndarray) -> EpisodeManifest:
         draws = [nominal(smoke, 0, i)._asdict() for i in range(count)]
         still = {name: np.array([draw[name] for draw in draws]) for name in draws[0]}
-        return dataclasses.replace(manifest(1, count), **(still | columns))
+        return dataclasses.replace(manifest(1, count, smoke), **(still | columns))
 
     return rows

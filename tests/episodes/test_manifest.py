@@ -4,6 +4,8 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from wbc_bench.episodes.freeze import build_manifest, freeze
@@ -129,6 +131,96 @@ def test_verify_finds_a_false_value(
     record(EpisodeManifest(**columns), path)
     failed = {line.name for line in verify(SMOKE, path, sample=12) if not line.ok}
     assert check in failed
+
+
+@pytest.mark.parametrize(
+    ("column", "rows", "value", "message"),
+    [
+        ("friction", 0, 2.0, r"friction is 0\.\d+ to 2, valid: 0.4 to 1"),
+        ("friction", 0, np.nan, "friction holds a number that is not finite"),
+        ("base_mass", slice(None), 0.5, "base_mass of episode 0/0 is not what the protocol's seed draws"),
+        ("kp_scale", slice(None), 1.0, "kp_scale of episode 0/0 is not what"),
+        ("noise_key", 3, 1, "noise_key of episode 0/3 is not what"),
+        ("noise_key", 3, -1, "noise_key is -1, valid: 0 or more"),
+        ("noise_scale", 0, 0.0, "noise_scale is 0 to 1, valid: 1 to 1"),
+        ("base_height", slice(None), 0.9, "base_height of episode 0/0"),
+        ("target_quat_w", 2, 0.5000001, "target quaternion is"),
+        ("target_pos_w", 1, 57.3, "height is not that of the target"),
+        ("target_pos_w", (1, 0), 57.3, "outside the protocol's box"),
+        ("height", 0, 0.5, "height is not that of the target"),
+        ("feasible_qpos", 0, np.nan, "feasible_qpos holds a number that is not finite"),
+        ("feasible_qpos", 0, 0.1, "feasible_qpos has a quaternion whose norm is not 1"),
+        ("push_time", 0, np.inf, "push_time"),
+        ("push_vel", 0, 9.0, "push_vel is"),
+        ("stratum", 0, "step", "strata"),
+        ("stratum", 0, "moon", "strata"),
+        ("condition", 0, "nominal", "conditions and orientations belong to reach targets"),
+        ("episode", 0, 1, "episode does not count the rows"),
+        ("replicate", slice(None), 0, "replicate does not count the rows"),
+    ],
+)
+def test_a_value_that_the_protocol_cannot_draw_is_refused_when_read(
+    smoke: EpisodeManifest,
+    tmp_path: Path,
+    column: str,
+    rows: int | tuple[int, int] | slice,
+    value: object,
+    message: str,
+) -> None:
+    """Even where the hash agrees."""
+    columns = {name: array.copy() for name, array in vars(smoke).items()}
+    columns[column][rows] = value
+    path = tmp_path / "smoke_v1.parquet"
+    record(EpisodeManifest(**columns), path)
+    with pytest.raises(ManifestError, match=message) as caught:
+        read_manifest(SMOKE, path)
+    assert str(path) in str(caught.value)
+
+
+def test_other_columns_types_and_counts_are_refused(smoke: EpisodeManifest, frozen: Path) -> None:
+    table = pq.read_table(frozen)
+
+    def refused(changed: pa.Table, message: str) -> None:
+        pq.write_table(changed, frozen)
+        frozen.with_suffix(".sha256").write_text(hashlib.sha256(frozen.read_bytes()).hexdigest())
+        with pytest.raises(ManifestError, match=message):
+            read_manifest(SMOKE, frozen)
+
+    place = table.column_names.index("friction")
+    refused(table.drop_columns(["friction"]), "has columns .*valid: .*friction")
+    refused(table.append_column("more", table["friction"]), r"\(12, 22\), valid: \(12, 21\)")
+    refused(table.slice(0, 11), r"\(11, 21\), valid: \(12, 21\)")
+    refused(pa.concat_tables([table, table]), r"\(24, 21\), valid")
+    refused(
+        table.set_column(place, "friction", table["friction"].cast("float32")),
+        "friction is of type float, valid: double",
+    )
+    place = table.column_names.index("leg_q")
+    shorter = pa.array([row[:7] for row in table["leg_q"].to_pylist()], pa.list_(pa.float64(), 7))
+    refused(table.set_column(place, "leg_q", shorter), r"leg_q is of type .*\[7\], valid: .*\[8\]")
+    place = table.column_names.index("stratum")
+    empty = pa.array([None, *table["stratum"].to_pylist()[1:]])
+    refused(table.set_column(place, "stratum", empty), "stratum has empty cells")
+
+
+def test_labels_of_a_ladder_are_checked(tmp_path: Path) -> None:
+    file = tmp_path / "ladder.toml"
+    file.write_text(LITTLE_LADDER)
+    protocol = read_protocol(file)
+    whole = build_manifest(protocol)
+    path = manifest_path(file)
+    for column, value, message in (
+        ("height", 1.5, "height of some episodes"),
+        ("orientation", "free", "orientation of some episodes"),
+        ("condition", "randomised", "condition of some episodes"),
+        ("target_pos_w", 2.0, "not within 0.01 m of its height"),
+    ):
+        columns = {name: array.copy() for name, array in vars(whole).items()}
+        columns[column][0] = value
+        write_manifest(EpisodeManifest(**columns), protocol, path)
+        path.with_suffix(".sha256").write_text(hashlib.sha256(path.read_bytes()).hexdigest())
+        with pytest.raises(ManifestError, match=message):
+            read_manifest(protocol, path)
 
 
 def test_a_stratum_that_the_box_does_not_hold_is_an_error(tmp_path: Path, monkeypatch) -> None:

@@ -57,6 +57,18 @@ def written(folder: Path, text: str) -> Path:
         ("seed = 7", "seed = 9223372036854775808", r"too large.* - at `\$\.episodes\.seed`"),
         ('type = "workspace"', 'type = "moon"', r"Invalid value 'moon' - at `\$\.targets\.type`"),
         ("[noise]", "[noise", r"mine\.toml: "),
+        ('name = "smoke_v1"', 'name = "протокол"', r"'протокол' cannot name a folder.* - at `\$\.name`"),
+        ('name = "smoke_v1"', 'name = "протокол-1"', r"cannot name a folder.*ASCII.* - at `\$\.name`"),
+        ('name = "smoke_v1"', 'name = ""', r"cannot name a folder of results.* - at `\$\.name`"),
+        ('name = "smoke_v1"', 'name = "mine/../../etc"', r"cannot name a folder.* - at `\$\.name`"),
+        ('name = "smoke_v1"', f'name = "{"n" * 121}"', r"1 to 120 ASCII letters.* - at `\$\.name`"),
+        ("horizon = 2.0", "horizon = 600.02", r"<= 600.0 - at `\$\.episodes\.horizon`"),
+        ("replicates = 2", "replicates = 1001", r"<= 1000 - at `\$\.episodes\.replicates`"),
+        ("per_replicate = 6", "per_replicate = 1000000", r"<= 100000 - at `\$\.episodes\.per_replicate`"),
+        ("per_replicate = 6", "per_replicate = 50001", r"2 x 50001 episodes, valid: at most 100000"),
+        ("arm = 1", "arm = 1001", r"<= 1000 - at `\$\.targets\.weights\[\.\.\.\]`"),
+        ("[noise]", "[physics]\ntimestep = 1e-9\n[noise]", r">= 0.0001 - at `\$\.physics\.timestep`"),
+        ("[noise]", "[physics]\ndecimation = 1001\n[noise]", r"<= 1000 - at `\$\.physics\.decimation`"),
     ],
 )
 def test_a_mistake_names_its_field(tmp_path: Path, old: str, new: str, message: str) -> None:
@@ -69,11 +81,18 @@ def test_a_mistake_names_its_field(tmp_path: Path, old: str, new: str, message: 
     assert str(path) in text and "\n" not in text
 
 
+def test_control_steps_of_an_episode_are_limited(tmp_path: Path) -> None:
+    text = SMOKE.replace("horizon = 2.0", "horizon = 300.0") + "\n[physics]\ndecimation = 1\n"
+    with pytest.raises(ProtocolError, match=r"300 s has more than 30000 control periods of 0.002 s - at"):
+        read_protocol(written(tmp_path, text))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("heights = [0.0, 2.0", "heights = [2.0, 0.0", r"heights 2 to 0 m.* - at `\$\.targets\.heights`"),
         ("heights = [0.0, 2.0, 0.05", "heights = [0.0, 2.0, 0.0", r"> 0.0 - at `\$\.targets\.heights\[2\]`"),
+        ("0.05]", "1e-300]", r"makes more than 100000 heights - at `\$\.targets\.heights`"),
         ('["free", "horizontal"]', "[]", r"at least one.* - at `\$\.targets\.orientations`"),
         ('["free", "horizontal"]', '["free", "free"]', r"each once - at `\$\.targets\.orientations`"),
         ('["free", "horizontal"]', '["down"]', r"'down' - at `\$\.targets\.orientations\[0\]`"),

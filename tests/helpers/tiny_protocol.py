@@ -45,9 +45,8 @@ window = 0.1
 """
 
 
-def manifest(protocol: EvalProtocol) -> EpisodeManifest:
+def manifest(replicates: int, episodes: int, protocol: EvalProtocol) -> EpisodeManifest:
     """Targets on a line, and the draws of the protocol: enough that no two episodes are alike."""
-    replicates, episodes = protocol.episodes.replicates, protocol.episodes.per_replicate
     count = replicates * episodes
     draws = zip(*(sample(protocol, k, i) for k in range(replicates) for i in range(episodes)), strict=True)
     return EpisodeManifest(
@@ -70,7 +69,7 @@ def write_tiny(folder: Path, replicates: int = 2, episodes: int = 6, horizon: fl
     path.write_text(TOML.format(replicates=replicates, episodes=episodes, horizon=horizon))
     frozen = manifest_path(path)
     protocol = read_protocol(path)
-    write_manifest(manifest(protocol), protocol, frozen)
+    write_manifest(manifest(replicates, episodes, protocol), protocol, frozen)
     sha256 = hashlib.sha256(frozen.read_bytes()).hexdigest()
     frozen.with_suffix(".sha256").write_text(f"{sha256}  {frozen.name}\n")
     return path

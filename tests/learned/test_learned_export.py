@@ -9,7 +9,7 @@ import torch
 
 from policies import networks, write
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.policy.onnx_engine import OnnxEngine
+from wbc_baselines.learned.policy.onnx_engine import OnnxEngine, seal
 from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.cli.main import main
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -111,6 +111,46 @@ def test_mistakes(exported, tmp_path):
     onnx.save(plain, broken)
     fails(f"onnx:{broken}", "carries no card")
     fails(f"onnx:{exported['gru']}", r"ee_xyz\[0\]", RobotConfig(tcp="link6"))
+
+
+@pytest.mark.parametrize("place", [0.0, 0.3, 0.6, 0.9, 0.99999])
+def test_a_flipped_bit_is_refused(exported, tmp_path, place):
+    """Weights, graph, card, and the digest itself: the digest at the end covers all bytes before it."""
+    data = bytearray(exported["gru"].read_bytes())
+    data[int(place * len(data))] ^= 1
+    path = tmp_path / "flipped.onnx"
+    path.write_bytes(data)
+    with pytest.raises(BenchError, match="is altered: SHA-256") as caught:
+        load_controller(f"onnx:{path}", load_robot())
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_digest_is_an_entry_of_the_metadata(exported):
+    from hashlib import sha256
+
+    data = exported["gru"].read_bytes()
+    entries = {entry.key: entry.value for entry in onnx.load(exported["gru"]).metadata_props}
+    assert set(entries) == {"card", "sha256"} and len(entries["sha256"]) == 64
+    model = data[: -len(seal(b""))]
+    assert entries["sha256"] == sha256(model).hexdigest() and model + seal(model) == data
+
+
+def test_another_graph_under_the_card_is_refused(exported, tmp_path):
+    """Also where the digest was made to fit."""
+    model = onnx.load(exported["gru"])
+    for change, word in (("input", "reads"), ("output", "writes")):
+        other = onnx.load(exported["no_latent"])
+        card = next(entry.value for entry in model.metadata_props if entry.key == "card")
+        if change == "output":
+            other.graph.output[0].name = "moved"
+            other.graph.node[-1].output[0] = "moved"
+            card = next(entry.value for entry in other.metadata_props if entry.key == "card")
+        onnx.helper.set_model_props(other, {"card": card})
+        data = other.SerializeToString()
+        path = tmp_path / "other.onnx"
+        path.write_bytes(data + seal(data))
+        with pytest.raises(BenchError, match=word):
+            load_controller(f"onnx:{path}", load_robot())
 
 
 @pytest.mark.parametrize("words", [["--controller", "hold"], ["--format", "tflite"]], ids=["hold", "format"])

@@ -362,6 +362,40 @@ def test_broken_policies_are_one_line(capsys, tmp_path: Path, how: str) -> None:
         assert str(path) in line and not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ("extra", "it has tensors that the method does not know, more (1 in all)"),
+        ("missing", "it lacks action_half (1 in all)"),
+        ("shape", "wrong shape of action_half (159,), valid: (160,)"),
+        ("type", "wrong type of action_half torch.float64, valid: torch.float32"),
+        ("infinite", "not a number in action_half"),
+    ],
+)
+def test_weights_that_are_not_the_networks_are_one_line(
+    capsys, tmp_path: Path, change: str, word: str
+) -> None:
+    from safetensors import safe_open
+    from safetensors.torch import load_file, save_file
+
+    path = tmp_path / "policy.safetensors"
+    save_policy(path, Policy(16), card())
+    tensors, half = load_file(path), Policy(16).action_half
+    with safe_open(path, "pt") as file:
+        metadata = file.metadata()
+    tensors |= {
+        "extra": {"more": torch.zeros(2)},
+        "shape": {"action_half": half[:-1].clone()},
+        "type": {"action_half": half.double()},
+        "infinite": {"action_half": half * torch.inf},
+    }.get(change, {})
+    if change == "missing":
+        del tensors["action_half"]
+    save_file(tensors, path, metadata)
+    line = fails(capsys, "track", "--controller", "hold", "--source", f"diffusion:{path}", "--out", tmp_path)
+    assert str(path) in line and word in line
+
+
 def test_the_doors_of_the_demonstrations_are_refused(capsys, tmp_path: Path) -> None:
     path = tmp_path / "policy.safetensors"
     save_policy(path, Policy(16), card(demonstrations_seed=5))

@@ -90,8 +90,8 @@ def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]
         if value.dtype.kind == "f" and field.name not in _MAY_BE_NAN and not np.isfinite(value).all():
             yield f"{field.name} holds a number that is not finite"
             return
-    yield from kind_of(protocol).count_mistakes(protocol, manifest)
     yield from kind_of(protocol).target_mistakes(protocol, manifest)
+    yield from kind_of(protocol).count_mistakes(protocol, manifest)
     for bound in bounds(protocol, manifest):
         if not bound.inside:
             low, high = (f"{np.ravel(edge)[0]:g}" for edge in (bound.low, bound.high))
