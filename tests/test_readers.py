@@ -121,7 +121,7 @@ def test_columns_of_a_table(tmp_path: Path) -> None:
     refused(lambda: read_parquet(path, "thing", StoreError, {"a": "double"}), "a is of type int64")
     refused(lambda: read_parquet(path, "thing", StoreError, {"b": "string"}), "b has empty cells")
     path.write_bytes(path.read_bytes()[:-9])
-    refused(lambda: read_parquet(path, "thing", StoreError), "not a parquet file")
+    refused(lambda: read_parquet(path, "thing", StoreError), "not readable parquet")
 
 
 def test_many_rows_in_few_bytes_are_not_allocated(tmp_path: Path) -> None:

@@ -31,8 +31,8 @@ def reading(kind: str, path: Path | str, valid: str, error: type[BenchError]) ->
     Args:
         kind: What the file is, e.g. "run record".
         path: The file.
-        valid: What its content must be, e.g. "a parquet file"; "" where people write it and the decoder's own
-            text says which field is wrong.
+        valid: What its content must be, e.g. "readable parquet"; "" where people write it and the decoder's
+            own text says which field is wrong.
         error: The error to raise.
 
     Raises:
@@ -153,7 +153,7 @@ def decode_parquet(
     import pyarrow.parquet as pq
 
     with (
-        reading(kind, path, "a parquet file", error),
+        reading(kind, path, "readable parquet", error),
         pq.ParquetFile(pa.BufferReader(data), **options) as file,
     ):
         parts = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]

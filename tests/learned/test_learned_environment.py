@@ -425,6 +425,18 @@ def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
     pq.write_table(pq.read_table(path).drop_columns("witness_qpos"), old)
     with pytest.raises(ManifestError, match=r"has columns stratum, pos_w, quat_w, valid: .*witness_qpos"):
         read_target_set(PROTOCOL, old)
+    sound = read_target_set(PROTOCOL, path)
+    for column, value, message in (
+        ("stratum", 3, "strata .*valid: 0 to 2"),
+        ("pos_w", np.nan, "pos_w holds a number that is not finite"),
+        ("quat_w", 2.0, "the norm of a quaternion is not 1"),
+        ("witness_qpos", 0.0, "the norm of a quaternion is not 1"),
+    ):
+        values = getattr(sound, column).copy()
+        values[0] = value
+        write_target_set(sound._replace(**{column: values}), PROTOCOL, old)
+        with pytest.raises(ManifestError, match=message):
+            read_target_set(PROTOCOL, old)
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ManifestError, match="not readable"):
         read_target_set(PROTOCOL, path)

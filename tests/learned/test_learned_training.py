@@ -346,6 +346,61 @@ def test_a_damaged_configuration_is_one_line(tmp_path):
         run(TINY, folder, tensorboard=False)
 
 
+@pytest.mark.parametrize(
+    "text", [b"[" * 100_000, b"[1]", b"1", b"\xff"], ids=["nested", "list", "number", "bytes"]
+)
+def test_a_configuration_that_is_no_configuration_is_one_line(tmp_path, text):
+    folder = RunFolder(tmp_path)
+    folder.config.write_bytes(text)
+    with pytest.raises(TrainingError, match=r"config\.json' is damaged"):
+        run(TINY, folder, tensorboard=False)
+
+
+def test_the_status_of_damaged_folders(tmp_path, capsys):
+    """What is no row is left out, what is no run is not listed, and a damaged note is one line."""
+    folder = RunFolder(tmp_path / "no_latent@0")
+    folder.open(TINY)
+    folder.append({"iteration": 1, "samples": 48, "seconds": 7200.0, "episode/success": 0.5})
+    with folder.metrics.open("ab") as file:
+        for line in (b"[1]", b"3", b'{"iteration": 2}', b'{"samples": 9}', b"[" * 100_000, b"\xff\xfe"):
+            file.write(line + b"\n")
+        file.write(b'{"iteration": null, "samples": 1}\n{"iteration": 2, "samples": "x"}\n')
+    for name in ("moon@0", "no_latent@x", "no_latent@", "@0"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text("{}")
+        (tmp_path / name / "metrics.jsonl").write_text('{"iteration": 1, "samples": 1}\n')
+    main(["status", "--out", str(tmp_path)])
+    told = capsys.readouterr().out
+    assert "| no_latent@0 | interrupted | 0.0 | 2.00 | 50.0 |  |" in told and "moon" not in told
+    assert [s.name for s in standing(tmp_path)] == ["no_latent@0"]
+    assert len(write_curves(tmp_path, tmp_path / "figures")) == 2
+    folder.finished.write_text('{"samples": "many"}')
+    with pytest.raises(TrainingError, match=r"finished\.json' is damaged"):
+        is_done(folder, TINY)
+    folder.metrics.unlink()
+    folder.metrics.mkdir()
+    with pytest.raises(SystemExit) as stopped:
+        main(["status", "--out", str(tmp_path)])
+    told = capsys.readouterr().err
+    assert stopped.value.code == 2 and told.count("\n") == 1 and "metrics.jsonl' is not a file" in told
+
+
+@pytest.mark.parametrize("text", [b"", b"PK\x03\x04", b"\x80\x02."])
+def test_a_resume_file_that_is_none_is_one_line(tmp_path, text):
+    folder, t = RunFolder(tmp_path / TINY.name), trainer()
+    folder.open(TINY)
+    folder.resume.write_bytes(text)
+    with pytest.raises(TrainingError, match=r"resume file .*resume\.pt' is damaged") as caught:
+        runs.load_resume(t, folder)
+    assert "\n" not in str(caught.value)
+    torch.save([1, 2], folder.resume)
+    with pytest.raises(TrainingError, match=r"resume\.pt' is damaged"):
+        runs.load_resume(t, folder)
+    torch.save(t.save() | {"seconds": 1.0, "actor": {}}, folder.resume)
+    with pytest.raises(TrainingError, match="of another version of the code"):
+        runs.load_resume(t, folder)
+
+
 def test_claims(tmp_path):
     """One process at a time; a dead process's claim and a stale one are taken over."""
     one, two = RunFolder(tmp_path), RunFolder(tmp_path)

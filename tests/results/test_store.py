@@ -1,6 +1,7 @@
 """The store: atomic, resumable, and never mixing runs of different keys."""
 
 import errno
+import hashlib
 import os
 import shutil
 import subprocess
@@ -8,13 +9,17 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
+from synthetic import FakeRun, episodes, record
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import ensure_writable, folder_name, write_atomic
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
+from wbc_bench.results.analysis import collect
 from wbc_bench.results.run_writer import RunWriter
 from wbc_bench.results.store import ResultStore, RunKey, ShardCost
 
@@ -295,3 +300,89 @@ def test_a_record_of_before_has_the_rule_of_v1(tmp_path):
 )
 def test_a_spec_as_a_folder_name(spec: str, name: str) -> None:
     assert folder_name(spec) == name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"replicate": 0', '"replicate": -1', "replicate is -1, valid: 0 or more"),
+        ('"completed": 7', '"completed": 6', "completed is 6, valid: 7, as many as requested"),
+        ('"success": 7', '"success": 8', "sum of outcomes is 8, valid: 7"),
+        ('"success": 7', '"succesr": 7', r"outcomes\.succesr is 7, valid: 0 or more of success"),
+        (
+            '"protocol_digest": "d',
+            '"protocol_digest": "D',
+            "protocol_digest is .*, valid: 64 hexadecimal",
+        ),
+        ('"window": 1.0', '"window": 0.0', r"rule\.window is 0.0, valid: above 0"),
+        ('"shard_episodes": 3', '"shard_episodes": 0', "shard_episodes is 0, valid: 1 or more"),
+        ('"requested": 7', '"reqnested": 7', "missing required field `requested`"),
+        ('"source": "test"', '"source": "te\\udc00t"', "run record"),
+        ('"versions": {}', '"versions": ' + "[" * 50_000, "run record"),
+    ],
+)
+def test_a_record_that_contradicts_itself_is_one_line(tmp_path, old, new, message):
+    path = finished(tmp_path).runs()[0].path / "run.json"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(StoreError, match=message) as caught:
+        ResultStore(tmp_path).runs()
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_every_flipped_bit_of_a_record_is_read_or_one_line(tmp_path):
+    path = finished(tmp_path).runs()[0].path / "run.json"
+    data = path.read_bytes()
+    for place in range(len(data)):
+        changed = bytearray(data)
+        changed[place] ^= 1 << place % 8
+        path.write_bytes(changed)
+        try:
+            [run.episodes() for run in ResultStore(tmp_path).runs()]
+        except StoreError as error:
+            assert "\n" not in str(error)
+
+
+def test_episodes_whose_hash_fits_and_whose_content_does_not(tmp_path):
+    (run,) = finished(tmp_path).runs()
+    path = run.path / "episodes.parquet"
+    whole = pq.read_table(path)
+
+    def refused(data: bytes, message: str) -> None:
+        path.write_bytes(data)
+        record = msgspec.structs.replace(run.record, episodes_sha256=hashlib.sha256(data).hexdigest())
+        (run.path / "run.json").write_bytes(msgspec.json.encode(record))
+        with pytest.raises(StoreError, match=message) as caught:
+            ResultStore(tmp_path).load("p", "a:b")
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+    def bytes_of(table: pa.Table) -> bytes:
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink)
+        return sink.getvalue().to_pybytes()
+
+    refused(b"not parquet", "not readable parquet")
+    refused(bytes_of(whole)[:-30] + b"x" * 30, "not readable parquet")
+    refused(bytes_of(whole.slice(0, 6)), "6 rows, valid: 7")
+    refused(bytes_of(whole.drop_columns(["outcome"])), "valid: episode, outcome")
+    place = whole.column_names.index("outcome")
+    fell = pa.array(["fell"] * 7)
+    refused(bytes_of(whole.set_column(place, "outcome", fell)), "ended with .*fell.*, its run.json says")
+
+
+def test_columns_that_tables_are_made_of(tmp_path):
+    """One that is missing, of another type or not finite is one line where records are collected."""
+    frame = episodes(0, 7, 1.0, 0)
+
+    def refused(changed: pd.DataFrame, message: str) -> None:
+        with pytest.raises(StoreError, match=message):
+            collect([FakeRun(record("ik", 0, frame), changed)])
+
+    refused(frame.drop(columns="height"), "have no column height, valid: .*height")
+    refused(frame.assign(height="tall"), "column height holds .*, valid: numbers")
+    refused(frame.assign(height=np.nan), "column height holds a number that is not finite")
+    refused(frame.assign(position_error=np.inf), "column position_error holds an infinite number")
+    refused(frame.assign(stratum=1), "column stratum holds int64, valid: text in every row")
+    refused(frame.assign(replicate=1), "column replicate holds others, valid: 0")
+    refused(frame.assign(success=0.5), "column success contradicts outcome")
