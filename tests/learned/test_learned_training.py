@@ -396,7 +396,7 @@ def test_a_resume_file_that_is_none_is_one_line(tmp_path, text):
     torch.save([1, 2], folder.resume)
     with pytest.raises(TrainingError, match=r"resume\.pt' is damaged"):
         runs.load_resume(t, folder)
-    torch.save(t.save() | {"seconds": 1.0, "actor": {}}, folder.resume)
+    torch.save({"seconds": 1.0}, folder.resume)
     with pytest.raises(TrainingError, match="of another version of the code"):
         runs.load_resume(t, folder)
 
