@@ -252,7 +252,9 @@ def test_fields_out_of_range_are_one_line(tmp_path, table: str, words: str) -> N
     from wbc_bench.errors import BenchError
 
     path = tmp_path / "own.toml"
-    path.write_text(TOML.format(replicates=1, episodes=6, horizon=0.2) + "\n" + table + "\n")
+    head, field = table.split("\n")
+    text = TOML.format(replicates=1, episodes=6, horizon=0.2)
+    path.write_text(text.replace(head, table) if head in text else f"{text}\n{head}\n{field}\n")
     with pytest.raises(BenchError, match=words) as caught:
         read_protocol(path)
     assert "\n" not in str(caught.value)

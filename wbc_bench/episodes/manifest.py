@@ -3,6 +3,7 @@
 import hashlib
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -103,7 +104,9 @@ def read_manifest(
         raise ManifestError(
             f"manifest '{path}' has (rows, columns) {table.shape}, valid: {(count, len(columns))}"
         )
-    manifest = EpisodeManifest(**found | {name: _array(table, name) for name in present})
+    columns_read: dict[str, Any] = dict(neutral(len(table)))
+    columns_read |= {name: _array(table, name) for name in present}
+    manifest = EpisodeManifest(**columns_read)
     if check_values:
         for mistake in mistakes(protocol, manifest):
             raise ManifestError(f"manifest '{path}': {mistake}; `wbc-bench protocol verify` tells all")

@@ -5,17 +5,20 @@ from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.randomization import EpisodeDraws, nominal, resting_height, sample
-from wbc_bench.episodes.rows import EpisodeManifest
+from wbc_bench.episodes.rows import EpisodeManifest, neutral
 from wbc_bench.episodes.targets import BEYOND
+from wbc_bench.episodes.terrain import TERRAIN_SPAN
 from wbc_bench.robot import load_robot
 
 SAME = 1e-9  # [m, rad] another processor rounds differently
 UNIT = 1e-12  # of the norm of a quaternion
+SAMPLED = 50  # rows of a manifest that are drawn again whenever it is read; `verify` draws all
+_LATER_RANGES = ("command_delay", "observation_delay", "odometry_delay", "payload", "motor_strength")
 _MAY_BE_NAN = ("push_time", "feasible_qpos")  # no push, no feasible pose
 _ZERO_IF_NOMINAL = ("base_mass", "base_vel", "leg_q", "leg_qd", "push_vel", "noise_scale")
 
@@ -25,8 +28,8 @@ class Bound(NamedTuple):
 
     name: str
     values: NDArray[np.float64]  # (N,) or (N, K)
-    low: ArrayLike
-    high: ArrayLike
+    low: float | NDArray[np.float64]
+    high: float | NDArray[np.float64]
 
     @property
     def inside(self) -> bool:
@@ -48,6 +51,7 @@ def bounds(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Bound]:
     noisy = manifest.take(np.flatnonzero(drawn))
     quiet = manifest.take(np.flatnonzero(~drawn))
     norm = np.linalg.norm(manifest.target_quat_w, axis=1)
+    later = neutral(1).items()
     velocity = np.array([spread.base_lin_vel] * 3 + [spread.base_ang_vel] * 3)
     found = [
         Bound("friction", noisy.friction, *spread.friction),
@@ -59,24 +63,39 @@ def bounds(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Bound]:
         Bound("kd_scale", noisy.kd_scale, *spread.gain),
         Bound("push_time", noisy.push_time, push.interval[0], protocol.episodes.horizon - push.quiet_end),
         Bound("push_vel", noisy.push_vel, -push.speed, push.speed),
+        Bound("push_vel_z", noisy.push_vel_z, -push.vertical_speed, push.vertical_speed),
+        Bound("push_ang_vel", noisy.push_ang_vel, -push.angular_speed, push.angular_speed),
+        *(Bound(name, getattr(noisy, name), *getattr(spread, name)) for name in _LATER_RANGES),
+        Bound("odometry_drift", noisy.odometry_drift, spread.odometry_drift, spread.odometry_drift),
+        Bound("payload_offset", noisy.payload_offset, -spread.payload_offset, spread.payload_offset),
+        Bound("joint_offset", noisy.joint_offset, -spread.joint_offset, spread.joint_offset),
+        Bound("imu_tilt", np.linalg.norm(noisy.imu_tilt, axis=1), 0, spread.gravity_tilt + SAME),
+        Bound("slope", np.linalg.norm(noisy.slope, axis=1), 0, spread.slope + SAME),
+        Bound("terrain_offset", noisy.terrain_offset, -TERRAIN_SPAN, TERRAIN_SPAN),
         Bound("noise_scale", noisy.noise_scale, 1, 1),
         Bound("target quaternion", norm, 1 - UNIT, 1 + UNIT),
         Bound("nominal friction", quiet.friction, slide, slide),
         *(Bound(f"nominal {name}", getattr(quiet, name), 0, 0) for name in _ZERO_IF_NOMINAL),
         Bound("nominal kp_scale", quiet.kp_scale, 1, 1),
         Bound("nominal kd_scale", quiet.kd_scale, 1, 1),
+        *(Bound(f"nominal {name}", getattr(quiet, name), *[column.flat[0]] * 2) for name, column in later),
     ]
     return [bound for bound in found if bound.values.size and not np.isnan(bound.values).all()]
 
 
 def height_error(protocol: EvalProtocol, manifest: EpisodeManifest) -> float:
     """Largest distance [m] of a base's height at reset from the one at which the soles touch the ground."""
-    heights = [resting_height(protocol.robot, leg_q) for leg_q in manifest.leg_q]
+    bumps = np.where(manifest.condition == "nominal", 0.0, protocol.randomization.step_height)
+    grounds = zip(manifest.leg_q, manifest.slope, bumps, manifest.terrain_offset, strict=True)
+    heights = [resting_height(protocol.robot, *ground) for ground in grounds]
     return float(np.abs(heights - manifest.base_height).max())
 
 
-def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
-    """What is wrong with the values of a manifest that has the protocol's columns and number of rows."""
+def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest, sampled: int = SAMPLED) -> Iterator[str]:
+    """What is wrong with the values of a manifest that has the protocol's columns and number of rows.
+
+    `sampled` rows, evenly spread, are drawn again: a column in a wrong unit may lie in its range.
+    """
     size = protocol.episodes.per_replicate
     for name, expected in (
         ("replicate", np.repeat(np.arange(protocol.episodes.replicates), size)),
@@ -100,13 +119,14 @@ def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]
         yield f"noise_key is {manifest.noise_key.min()}, valid: 0 or more"
     yield from _push_mistakes(protocol, manifest)
     yield from _pose_mistakes(manifest)
-    yield from _draw_mistakes(protocol, manifest)
+    spread = np.linspace(0, len(manifest) - 1, min(sampled, len(manifest))).astype(np.int64)
+    yield from _draw_mistakes(protocol, manifest.take(spread))
 
 
 def _push_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
     time = manifest.push_time
     none = np.isnan(time)
-    if not none.all() and protocol.push.speed == 0:
+    if not none.all() and not protocol.push.some:
         yield "push_time holds pushes, and the protocol has none"
     if not none[manifest.condition == "nominal"].all():
         yield "push_time holds pushes of nominal episodes, valid: none"
@@ -128,7 +148,7 @@ def _pose_mistakes(manifest: EpisodeManifest) -> Iterator[str]:
 
 
 def _draw_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
-    """Columns that are not what the protocol's seed draws: a wrong unit may lie in the range."""
+    """Columns that are not what the protocol's seed draws."""
     rows = zip(manifest.replicate.tolist(), manifest.episode.tolist(), manifest.condition, strict=True)
     drawn = [(nominal if kind == "nominal" else sample)(protocol, k, i) for k, i, kind in rows]
     for name, values in zip(EpisodeDraws._fields, zip(*drawn, strict=True), strict=True):
