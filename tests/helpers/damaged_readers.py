@@ -127,7 +127,7 @@ def write_facts(folder: Path) -> None:
 
 
 def read_facts(folder: Path) -> None:
-    load_facts.__wrapped__(folder / FACTS_FILE.name)
+    load_facts.__wrapped__(path=folder / FACTS_FILE.name)
 
 
 # --- records --------------------------------------------------------------------------------------------

@@ -10,14 +10,18 @@ from numpy.typing import ArrayLike, NDArray
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.randomization import EpisodeDraws, nominal, resting_height, sample
-from wbc_bench.episodes.rows import EpisodeManifest
+from wbc_bench.episodes.rows import EpisodeManifest, neutral
 from wbc_bench.episodes.targets import BEYOND
+from wbc_bench.episodes.terrain import TERRAIN_SPAN
 from wbc_bench.robot import load_robot
 
 SAME = 1e-9  # [m, rad] another processor rounds differently
 UNIT = 1e-12  # of the norm of a quaternion
 _MAY_BE_NAN = ("push_time", "feasible_qpos")  # no push, no feasible pose
 _ZERO_IF_NOMINAL = ("base_mass", "base_vel", "leg_q", "leg_qd", "push_vel", "noise_scale")
+
+
+_LATER_RANGES = ("command_delay", "observation_delay", "odometry_delay", "payload", "motor_strength")
 
 
 class Bound(NamedTuple):
@@ -59,10 +63,20 @@ def bounds(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Bound]:
         Bound("kd_scale", noisy.kd_scale, *spread.gain),
         Bound("push_time", noisy.push_time, push.interval[0], protocol.episodes.horizon - push.quiet_end),
         Bound("push_vel", noisy.push_vel, -push.speed, push.speed),
+        Bound("push_vel_z", noisy.push_vel_z, -push.vertical_speed, push.vertical_speed),
+        Bound("push_ang_vel", noisy.push_ang_vel, -push.angular_speed, push.angular_speed),
+        *(Bound(name, getattr(noisy, name), *getattr(spread, name)) for name in _LATER_RANGES),
+        Bound("odometry_drift", noisy.odometry_drift, spread.odometry_drift, spread.odometry_drift),
+        Bound("payload_offset", noisy.payload_offset, -spread.payload_offset, spread.payload_offset),
+        Bound("joint_offset", noisy.joint_offset, -spread.joint_offset, spread.joint_offset),
+        Bound("imu_tilt", np.linalg.norm(noisy.imu_tilt, axis=1), 0, spread.gravity_tilt + SAME),
+        Bound("slope", np.linalg.norm(noisy.slope, axis=1), 0, spread.slope + SAME),
+        Bound("terrain_offset", noisy.terrain_offset, -TERRAIN_SPAN, TERRAIN_SPAN),
         Bound("noise_scale", noisy.noise_scale, 1, 1),
         Bound("target quaternion", norm, 1 - UNIT, 1 + UNIT),
         Bound("nominal friction", quiet.friction, slide, slide),
         *(Bound(f"nominal {name}", getattr(quiet, name), 0, 0) for name in _ZERO_IF_NOMINAL),
+        *(Bound(f"nominal {name}", getattr(quiet, name), value, value) for name, value in _later_nominal()),
         Bound("nominal kp_scale", quiet.kp_scale, 1, 1),
         Bound("nominal kd_scale", quiet.kd_scale, 1, 1),
     ]
@@ -71,8 +85,18 @@ def bounds(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Bound]:
 
 def height_error(protocol: EvalProtocol, manifest: EpisodeManifest) -> float:
     """Largest distance [m] of a base's height at reset from the one at which the soles touch the ground."""
-    heights = [resting_height(protocol.robot, leg_q) for leg_q in manifest.leg_q]
+    step = protocol.randomization.step_height
+    rows = zip(manifest.leg_q, manifest.slope, manifest.terrain_offset, manifest.condition, strict=True)
+    heights = [
+        resting_height(protocol.robot, leg_q, slope, 0.0 if condition == "nominal" else step, offset)
+        for leg_q, slope, offset, condition in rows
+    ]
     return float(np.abs(heights - manifest.base_height).max())
+
+
+def _later_nominal() -> list[tuple[str, float]]:
+    """The later columns and the one value that a nominal episode has in each."""
+    return [(name, float(column.flat[0])) for name, column in neutral(1).items()]
 
 
 def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
@@ -106,7 +130,7 @@ def mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]
 def _push_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
     time = manifest.push_time
     none = np.isnan(time)
-    if not none.all() and protocol.push.speed == 0:
+    if not none.all() and not protocol.push.some:
         yield "push_time holds pushes, and the protocol has none"
     if not none[manifest.condition == "nominal"].all():
         yield "push_time holds pushes of nominal episodes, valid: none"

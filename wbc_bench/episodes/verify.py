@@ -60,7 +60,7 @@ def _check_ranges(protocol: EvalProtocol, manifest: EpisodeManifest) -> list[Che
     checks = [
         Check(f"range of {bound.name}", bound.inside, bound.extent) for bound in bounds(protocol, manifest)
     ]
-    if protocol.push.speed == 0:
+    if not protocol.push.some:
         checks.append(Check("no pushes", bool(np.isnan(manifest.push_time).all()), "none asked"))
     worst = height_error(protocol, manifest)
     checks.append(Check("soles on the ground at reset", worst < SAME, f"off by at most {worst:.1e} m"))
