@@ -5,7 +5,7 @@ from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -29,8 +29,8 @@ class Bound(NamedTuple):
 
     name: str
     values: NDArray[np.float64]  # (N,) or (N, K)
-    low: ArrayLike
-    high: ArrayLike
+    low: float | NDArray[np.float64]
+    high: float | NDArray[np.float64]
 
     @property
     def inside(self) -> bool:
