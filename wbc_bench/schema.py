@@ -22,14 +22,12 @@ def meaning(value: Any) -> Any:
     if isinstance(value, tuple):
         return [meaning(item) for item in value]
     if not isinstance(value, msgspec.Struct):
-        return msgspec.to_builtins(value)
+        return msgspec.to_builtins(value, order="deterministic")
     later = getattr(type(value), "LATER", frozenset())
-    found = {}
+    config = type(value).__struct_config__
+    found = {} if config.tag is None else {config.tag_field: config.tag}  # first, as msgspec writes it
     for field in msgspec.structs.fields(value):
         item = getattr(value, field.name)
         if field.name not in later or item != field.default:
             found[field.encode_name] = meaning(item)
-    config = type(value).__struct_config__
-    if config.tag is not None:
-        found[config.tag_field] = config.tag
     return found

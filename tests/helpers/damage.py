@@ -238,7 +238,7 @@ def scale_values(rng: Rng, table: pa.Table) -> pa.Table:
     place = int(rng.integers(table.num_columns))
     kind = table.schema.field(place).type
     factor = [-1.0, 1e3, 1e-3, 57.29577951308232][rng.integers(4)]
-    values = table.column(place).to_pylist() or [None]
+    values: list[Any] = table.column(place).to_pylist() or [None]
     if isinstance(values[0], list):
         return _set(table, place, pa.array([[v * factor for v in row] for row in values], kind))
     if isinstance(values[0], float):

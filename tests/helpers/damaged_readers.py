@@ -127,7 +127,7 @@ def write_facts(folder: Path) -> None:
 
 
 def read_facts(folder: Path) -> None:
-    load_facts.__wrapped__(folder / FACTS_FILE.name)
+    load_facts.__wrapped__(path=folder / FACTS_FILE.name)
 
 
 # --- records --------------------------------------------------------------------------------------------
@@ -137,9 +137,16 @@ MADE |= {"created": "2026-01-01T00:00:00+00:00"}
 
 
 def _key(protocol: str, count: int) -> RunKey:
-    names = {"protocol": protocol, "controller": "a:b", "protocol_digest": "d" * 64}
-    sizes = {"replicate": 0, "requested": count, "shard_episodes": 50}
-    return RunKey(**names, **sizes, manifest_sha256="e" * 64, software_sha256="f" * 64)
+    return RunKey(
+        protocol=protocol,
+        protocol_digest="d" * 64,
+        manifest_sha256="e" * 64,
+        controller="a:b",
+        replicate=0,
+        requested=count,
+        shard_episodes=50,
+        software_sha256="f" * 64,
+    )
 
 
 def write_runs(folder: Path) -> None:
@@ -170,7 +177,7 @@ def seal_runs(folder: Path) -> None:
 
 
 def write_tracks(folder: Path) -> None:
-    time = np.arange(100) * 0.02
+    time = np.arange(100, dtype=np.float64) * 0.02
     pos = np.stack([np.sin(time), np.cos(time), time], axis=1)
     facts = {"source": "s", "source_sha256": None, "controller": "ik", "signals": ["ee_pose"], "seed": 0}
     facts |= {"condition": "nominal", "requested_s": 2.0, "counters": {"accepted": 1}}
@@ -295,7 +302,7 @@ def read_training(folder: Path) -> None:
 
 
 def write_targets(folder: Path) -> None:
-    part = TargetSet(*(values[:30] for values in TARGETS))
+    part = TargetSet(TARGETS.stratum[:30], TARGETS.pos_w[:30], TARGETS.quat_w[:30], TARGETS.witness_qpos[:30])
     write_target_set(part, PROTOCOL, folder / "targets.parquet")
 
 

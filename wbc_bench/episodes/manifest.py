@@ -96,7 +96,7 @@ def read_manifest(
             f"the protocol {protocol.name} has {protocol.digest[:16]}...: freeze it again"
         )
     check_robot(table, protocol, f"manifest '{path}'", "freeze it again")
-    found = neutral(len(table))
+    found: dict[str, Any] = {**neutral(len(table))}
     present = [f.name for f in fields(EpisodeManifest) if f.name not in found or f.name in table.column_names]
     columns = {_column(name): _type(name) for name in present}
     check_columns(table, path, "manifest", ManifestError, columns)

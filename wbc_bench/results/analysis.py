@@ -133,7 +133,7 @@ def _episodes(run: RunLike) -> pd.DataFrame:
             )
         values = episodes[name]
         if name in TEXTS:
-            if values.isna().any() or not values.map(lambda value: isinstance(value, str)).all():
+            if not all(isinstance(value, str) for value in values):
                 raise StoreError(f"{where}: column {name} holds {values.dtype}, valid: text in every row")
         elif values.dtype.kind not in "iuf":
             raise StoreError(f"{where}: column {name} holds {values.dtype}, valid: numbers")
