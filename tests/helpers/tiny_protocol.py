@@ -31,17 +31,19 @@ weights = {{ arm = 1 }}
 step_distance = [0.1, 0.2]
 step_yaw = [0.0, 0.0]
 
-[randomization]
-friction = [0.5, 1.0]
-base_mass = [0.0, 1.0]
-base_lin_vel = 0.1
-base_ang_vel = 0.1
-
 [noise]
 joint_pos = 0.01
 
 [success]
 window = 0.1
+"""
+
+RANDOMIZATION = """
+[randomization]
+friction = [0.5, 1.0]
+base_mass = [0.0, 1.0]
+base_lin_vel = 0.1
+base_ang_vel = 0.1
 """
 
 
@@ -66,7 +68,8 @@ def manifest(replicates: int, episodes: int, protocol: EvalProtocol) -> EpisodeM
 def write_tiny(folder: Path, replicates: int = 2, episodes: int = 6, horizon: float = 0.2) -> Path:
     """Write protocol, manifest and hash; the path of the protocol."""
     path = folder / "tiny.toml"
-    path.write_text(TOML.format(replicates=replicates, episodes=episodes, horizon=horizon))
+    text = TOML.format(replicates=replicates, episodes=episodes, horizon=horizon)
+    path.write_text(text + RANDOMIZATION)
     frozen = manifest_path(path)
     protocol = read_protocol(path)
     write_manifest(manifest(replicates, episodes, protocol), protocol, frozen)
