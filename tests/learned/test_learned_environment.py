@@ -434,7 +434,7 @@ def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
     ):
         values = getattr(sound, column).copy()
         values[0] = value
-        write_target_set(sound._replace(**{column: values}), PROTOCOL, old)
+        write_target_set(TargetSet(**{**sound._asdict(), column: values}), PROTOCOL, old)
         with pytest.raises(ManifestError, match=message):
             read_target_set(PROTOCOL, old)
     path.write_bytes(path.read_bytes()[:100])

@@ -69,11 +69,13 @@ def scale_disturbances(protocol: EvalProtocol, scale: float) -> EvalProtocol:
         return msgspec.convert(found, type(struct))
 
     slide = load_robot(protocol.robot).facts.friction.slide
+    names = ("speed", "vertical_speed", "angular_speed")
+    speeds = {name: scale * getattr(protocol.push, name) for name in names}
     return msgspec.structs.replace(
         protocol,
         noise=scaled(protocol.noise),
-        push=msgspec.structs.replace(protocol.push, speed=scale * protocol.push.speed),
-        randomization=scaled(protocol.randomization, friction=slide, gain=1.0),
+        push=msgspec.structs.replace(protocol.push, **speeds),
+        randomization=scaled(protocol.randomization, friction=slide, gain=1.0, motor_strength=1.0),
     )
 
 
