@@ -20,7 +20,7 @@ LAYERS = (
     ("controller",),
     ("episodes",),
     ("robot", "results", "tensors"),
-    ("provenance", "progress", "outcomes", "files", "readers", "schema"),
+    ("provenance", "progress", "outcomes", "files", "readers", "schema", "installed"),
     ("rotations", "randomness", "errors"),
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")

@@ -7,7 +7,8 @@ import pytest
 
 from wbc_bench.controller import DEPLOYABLE, SIGNALS
 from wbc_bench.errors import ControllerError, UnknownNameError
-from wbc_bench.registry import controllers, load_controller
+from wbc_bench.installed import controllers
+from wbc_bench.registry import load_controller
 from wbc_bench.robot import Robot, load_robot
 
 SOURCE = """

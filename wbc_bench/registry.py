@@ -4,21 +4,15 @@ import importlib
 import pickle
 import sys
 from collections.abc import Callable
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 from wbc_bench import provenance
 from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, SeededFactory
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
+from wbc_bench.installed import controllers
 from wbc_bench.robot import Robot
 
-ENTRY_POINTS = "wbc_bench.controllers"
 ControllerFactory = Callable[[Robot], Controller]
-
-
-def controllers() -> dict[str, EntryPoint]:
-    """Installed controllers by name."""
-    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 
 def load_controller(spec: str, robot: Robot) -> Controller:

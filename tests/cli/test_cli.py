@@ -300,13 +300,13 @@ def test_list_needs_no_torch(tmp_path):
 def test_installed_factories_without_variants_or_that_fail_are_listed(capsys, tmp_path, monkeypatch):
     from importlib.metadata import EntryPoint
 
-    from wbc_bench import registry
+    from wbc_bench import installed
 
     found = {
-        "plain": EntryPoint("plain", "json:dumps", registry.ENTRY_POINTS),
-        "gone": EntryPoint("gone", "no_such_module:Mine", registry.ENTRY_POINTS),
+        "plain": EntryPoint("plain", "json:dumps", installed.ENTRY_POINTS),
+        "gone": EntryPoint("gone", "no_such_module:Mine", installed.ENTRY_POINTS),
     }
-    monkeypatch.setattr(registry, "controllers", lambda: found)
+    monkeypatch.setattr(installed, "controllers", lambda: found)
     main(["list", "--results", str(tmp_path)])
     rows = {row[0]: row for row in listed_controllers(capsys.readouterr().out)}
     assert rows["plain"][2:] == ["", "json:dumps"]

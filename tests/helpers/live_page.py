@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from wbc_bench.episodes.single import LONGEST, free_episode
+from wbc_bench.viewer.guard import Guard
 from wbc_bench.viewer.session import Session
 
 
@@ -30,8 +31,10 @@ class Served:
 
         self.session, self._stop, self._ready = session_of("ik", "live"), threading.Event(), threading.Event()
 
+        self.guard = Guard(remote=False)
+
         def run() -> None:
-            with serving(port=free_port()) as self.server:
+            with serving(port=free_port(), guard=self.guard) as self.server:
                 self.view = LiveView(self.server, self.session)
                 self._ready.set()
                 self.view.run(self._stop.is_set)
@@ -39,7 +42,7 @@ class Served:
         self._thread = threading.Thread(target=run, daemon=True)
         self._thread.start()
         assert self._ready.wait(60)
-        self.url = f"http://127.0.0.1:{self.server.get_port()}"
+        self.url = self.guard.address("127.0.0.1", self.server.get_port())
 
     def close(self) -> None:
         self._stop.set()

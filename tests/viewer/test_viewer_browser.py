@@ -1,7 +1,10 @@
 """The live view in headless Chromium: a person drags the target with the mouse, and the hand follows."""
 
 import shutil
+import threading
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -83,6 +86,42 @@ def test_the_hand_follows_the_dragged_gizmo_and_a_second_browser_sees_it(browser
         shown = one.locator("input").evaluate_all("all => all.map(input => input.value)")
         assert any(abs(float(value) - goal[2]) < 2e-3 for value in shown if _is_number(value)), shown
     assert not problems, problems
+
+
+def test_a_page_of_another_site_in_the_same_browser_is_refused(browsers, served: Served) -> None:
+    """It knows the port, and its browser has the cookie of the page: its socket and its requests fail."""
+    problems: list[str] = []
+    context = browsers[0].new_context(viewport=SIZE, device_scale_factor=COARSE)
+    page = context.new_page()
+    page.goto(served.url, wait_until="commit", timeout=60_000)
+    page.wait_for_selector("text=position", timeout=60_000)
+    wait_for(lambda: len(served.server.get_clients()) == 1, 60, "the page itself is connected")
+    place = urlsplit(served.url)
+
+    class Foreign(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<html>a page of another site</html>")
+
+        def log_message(self, format: str, *args) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Foreign) as foreign:
+        threading.Thread(target=foreign.serve_forever, daemon=True).start()
+        other = context.new_page()
+        other.goto(f"http://127.0.0.1:{foreign.server_port}/")
+        script = f"""() => new Promise(done => {{
+            const socket = new WebSocket("ws://{place.netloc}", ["viser-v1.1.1"]);
+            socket.onopen = () => done("open"); socket.onerror = () => done("refused");
+        }})"""
+        assert other.evaluate(script) == "refused"
+        read = f"() => fetch('http://{place.netloc}/').then(() => 'read', () => 'refused')"
+        assert other.evaluate(read) == "refused"
+        foreign.shutdown()
+    assert len(served.server.get_clients()) == 1
+    assert not problems
 
 
 def _is_number(text: str) -> bool:

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 
 from live_page import Served, free_port, session_of, wait_for
+from wbc_bench.controller import ControllerInfo, JointCommand
 from wbc_bench.episodes.single import episode_of
 from wbc_bench.errors import BenchError, SourceError, UnknownNameError
+from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.results.tracking import STOOD
 from wbc_bench.sources.slew import Limits
+from wbc_bench.viewer.panel import _number
 from wbc_bench.viewer.session import Session
 
 AWAY = np.array([0.06, -0.08, 0.04])  # [m] from the hand, within reach of the arm
@@ -106,7 +109,7 @@ def test_the_gizmo_sets_the_target_and_the_field_shows_it(served: Served) -> Non
     view, session = served.view, served.session
     goal = session.moment.ee_pos_w + AWAY
     view.gizmo.position, view.gizmo.wxyz = goal, (1.0, 0.0, 0.0, 0.0)
-    view._goal_moved()  # what viser calls after a drag
+    view.ask(view._goal_moved)  # what viser calls after a drag
     wait_for(lambda: bool(np.linalg.norm(session.moment.ee_pos_w - goal) < 0.02), 60, "the hand is there")
     assert np.allclose(view.panel._pos.value, goal, atol=1e-3)
     view.ask(lambda: view.restart("holt"))
@@ -130,7 +133,7 @@ def test_the_time_of_a_scored_run_begins_with_the_first_drag() -> None:
         time.sleep(0.3)
         assert session.moment.time == 0.0 and "waiting" in view.panel._state.content
         view.gizmo.position = session.moment.ee_pos_w + AWAY
-        view._goal_moved()  # what viser calls after a drag
+        view.ask(view._goal_moved)  # what viser calls after a drag
         thread.join(30)
         stop.set()
     tracked = session.tracked
@@ -158,6 +161,65 @@ def test_a_scene_is_drawn_with_what_surrounds_the_robot() -> None:
         assert {name for name in server.scene._handle_from_node_name if "/body/" in name} == {
             name for name in bare if "/body/" in name
         }
+
+
+class Stumbles:
+    """Holds, and raises at one control step."""
+
+    def __init__(self, robot) -> None:
+        self.info = ControllerInfo("stumbles", frozenset(), 0.02, "this test")
+        self._q, self.steps = robot.default_q, 0
+
+    def reset(self, episodes, obs, target) -> None:
+        self.steps = 0
+
+    def act(self, obs, target) -> JointCommand:
+        self.steps += 1
+        if self.steps == 10:
+            raise ZeroDivisionError("a mistake of its author")
+        return JointCommand(np.tile(self._q, (len(obs.active), 1)))
+
+
+def test_a_controller_that_raises_pauses_the_page_which_says_why(served: Served) -> None:
+    view, session = served.view, served.session
+    view.ask(lambda: setattr(session, "_loop", loop))
+    loop = ControlLoop(Stumbles(session.robot), session.protocol, session._row)
+    loop.reset(session._target())
+    view.ask(lambda: None)
+    wait_for(lambda: view.paused, 20, "it is paused")
+    said = view.panel._message.content
+    assert "a mistake of its author" in said and "control step 9" in said
+    view.ask(view.restart)
+    view.ask(lambda: setattr(view, "paused", False))
+    wait_for(lambda: session.moment.time > 0.3, 20, "it goes on with another controller")
+
+
+def test_what_a_page_sends_is_checked_against_what_it_offers(served: Served, tmp_path) -> None:
+    """A crafted message is one line in the page: nothing is imported, and the time goes on."""
+    view, session, panel = served.view, served.session, served.view.panel
+    trap = tmp_path / "trap.py"
+    trap.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+
+    def says(words: str) -> None:
+        wait_for(lambda: words in panel._message.content and panel._message.visible, 20, words)
+
+    panel._spec.value = f"{trap}:make"
+    view.ask(panel._choose)
+    says("unknown choice")
+    assert not (tmp_path / "ran").exists() and panel._spec.value == session.spec == "ik"
+    for speed in (0.0, float("nan"), float("inf"), 1e9, "fast"):
+        view.ask(lambda speed=speed: view.set_speed(_number(speed)))
+        says("valid: 0.1 to 2" if speed != "fast" else "not a number")
+    panel._rpy.value = (float("inf"), 0.0, 0.0)
+    view.ask(panel._typed)
+    says("six finite numbers")
+    view.gizmo.position = (float("nan"), 0.0, 0.0)
+    view.ask(view._goal_moved)
+    says("no pose within 10 m")
+    view.ask(lambda: panel._push("up"))
+    says("unknown choice 'up'")
+    before = session.moment.time
+    wait_for(lambda: session.moment.time > before + 0.1, 20, "time goes on")
 
 
 def test_a_port_that_is_taken_is_refused() -> None:

@@ -2,15 +2,21 @@
 
 import dataclasses
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from runs import evaluated
+from tiny_protocol import write_tiny
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.errors import StoreError, UnknownNameError
+from wbc_bench.evaluation.evaluate import evaluate
+from wbc_bench.results.gallery import replay_command
 from wbc_bench.results.store import ResultStore, Run
 from wbc_bench.viewer import rerun as rerun_module
 from wbc_bench.viewer.moment import Moment, Skeleton
@@ -81,14 +87,40 @@ def test_a_controller_that_rounds_with_its_company_is_run_in_its_shard(
     sizes = []
     inner = rerun_module._watched
     monkeypatch.setattr(rerun_module, "_watched", lambda *args: sizes.append(len(args[3])) or inner(*args))
-    again = rerun(run, 4)
+    again = rerun(run, 4, controller=f"{file}:Mine")
     assert sizes == [1, 6] and not again.differences
     # on another processor the shard would cost minutes and prove nothing
     elsewhere = dataclasses.replace(
         run, record=type(run.record)(**{**_fields(run.record), "machine": {"processor": "another"}})
     )
     sizes.clear()
-    assert "another" in rerun(elsewhere, 4).verdict and sizes == [1]
+    assert "another" in rerun(elsewhere, 4, controller=f"{file}:Mine").verdict and sizes == [1]
+
+
+def test_a_record_alone_never_runs_a_file(tmp_path: Path) -> None:
+    """Whoever sends a record would run code on this machine: its controller must be installed, or given."""
+    file, mark = tmp_path / "sent_along.py", tmp_path / "ran"
+    file.write_text(BATCHED)
+    run = evaluated(tmp_path / "store", f"{file}:Mine")
+    file.write_text(f"open({str(mark)!r}, 'w')\n{BATCHED}")
+    with pytest.raises(StoreError, match=r"not an installed controller: give `--controller .*sent_along"):
+        rerun(run, 0)
+    assert not mark.exists()
+    rerun(run, 0, controller=f"{file}:Mine")
+    assert mark.exists()
+
+
+def test_a_run_of_a_user_s_own_protocol_is_replayed_by_the_command_of_its_report(tmp_path: Path) -> None:
+    """As it is printed, in the folder of the records, after the protocol's own files are gone."""
+    pytest.importorskip("viser")
+    own = write_tiny(tmp_path)
+    root = tmp_path / "out"
+    evaluate("hold", str(own), out=root)
+    for left in tmp_path.glob("tiny.*"):
+        left.unlink()
+    words = [sys.executable, "-m", "wbc_bench", *shlex.split(replay_command("tiny", "hold", 0, 1))[1:]]
+    done = subprocess.run(words, cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0 and "verified: all" in done.stdout, done.stderr
 
 
 def _fields(record) -> dict:

@@ -62,7 +62,7 @@ def _inputs() -> "Iterator[Table]":
 
 def _controllers(runs: "list[Run]") -> "Table":
     """Every name that `--controller` takes, with the episodes of one protocol that the runs solved."""
-    from wbc_bench.registry import controllers
+    from wbc_bench.installed import controllers
     from wbc_bench.results.table import Table
 
     rows = [

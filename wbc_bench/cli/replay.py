@@ -23,7 +23,11 @@ class _Again:
     results: Path = RESULTS
     """Folder to read the records from."""
     protocol: str | None = None
-    """Path of the .toml file of the run's protocol; needed only if that is not a released one."""
+    """Path of the .toml file of the run's protocol; needed only if that is neither a released one nor kept
+    beside the run."""
+    controller: str | None = None
+    """Controller to run, which is code of yours: module:attribute or file.py:attribute. Needed if the one of
+    the record is not installed; a file that a record names is never run for that alone."""
 
     def _find(self) -> "Run":
         """The run, given by its folder or by its name below the folder of the records."""
@@ -54,7 +58,7 @@ class Replay(_Again):
         self._check_folder(self.out)
         run = self._find()
         with Progress("steps") as progress:
-            again = write_html(run, self.episode, self.out, self.protocol, progress.update)
+            again = write_html(run, self.episode, self.out, self.protocol, progress.update, self.controller)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}\n{self.out}")
 
 
@@ -96,7 +100,7 @@ class Film(_Again):
                 self._check_folder(path)
         run = self._find()
         with Progress("steps") as progress:
-            again = rerun(run, self.episode, self.protocol, progress.update)
+            again = rerun(run, self.episode, self.protocol, progress.update, self.controller)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}")
         if self.out:
             with Progress("pictures") as progress:

@@ -63,9 +63,12 @@ class EpisodeManifest:
         return self.take(np.flatnonzero(self.replicate == replicate)[:count])
 
 
-def neutral(count: int) -> dict[str, NDArray[np.float64]]:
-    """The later columns (`count`, ...) of episodes without any of the disturbances that they hold."""
-    widths = {"push_vel_z": MAX_PUSHES, "push_ang_vel": 3 * MAX_PUSHES, "joint_offset": NUM_JOINTS}
+def neutral(count: int, pushes: int = MAX_PUSHES) -> dict[str, NDArray[np.float64]]:
+    """The later columns (`count`, ...) of episodes without any of the disturbances that they hold.
+
+    `pushes` is the room for them, other than that of a manifest where no manifest is written.
+    """
+    widths = {"push_vel_z": pushes, "push_ang_vel": 3 * pushes, "joint_offset": NUM_JOINTS}
     widths |= {"payload_offset": 3, "imu_tilt": 2, "slope": 2, "terrain_offset": 2}
     scalars = ("command_delay", "observation_delay", "odometry_delay", "odometry_drift", "payload")
     columns = {name: np.zeros((count, width)) for name, width in widths.items()}

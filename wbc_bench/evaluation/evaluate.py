@@ -13,7 +13,7 @@ from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import BenchError, UnknownNameError
 from wbc_bench.evaluation.execution import Job, run_jobs
 from wbc_bench.evaluation.workers import Engine
-from wbc_bench.files import ensure_writable
+from wbc_bench.files import PROTOCOLS, ensure_writable
 from wbc_bench.registry import ControllerFactory, build_controller, pack_controller, spec_of_replicate
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import Evaluated, collect, column
@@ -34,6 +34,7 @@ class Asked:
     """A part of a protocol: which episodes, of how many replicates."""
 
     protocol: EvalProtocol
+    path: Path  # of the protocol's file
     manifest: EpisodeManifest
     manifest_sha256: str
     replicates: int
@@ -52,6 +53,7 @@ class Asked:
         most = found.episodes
         return cls(
             found,
+            path,
             *read_manifest(found, manifest_path(path)),
             _within("replicates", replicates, most.replicates, f"replicates of {found.name}"),
             _within("episodes", episodes, most.per_replicate, f"episodes per replicate of {found.name}"),
@@ -180,6 +182,8 @@ def evaluate_all(
             jobs.append(Job(*frozen, name, replicates, asked.episodes, packed))
     ensure_writable(store.root)
     run_jobs(jobs, store, engine, overwrite)
+    if asked.path.resolve().parent != PROTOCOLS.resolve():
+        store.keep_protocol(asked.protocol.name, asked.path, manifest_path(asked.path))
     return skipped
 
 

@@ -1,12 +1,14 @@
 """The gallery of a report: of each controller the worst episodes of each outcome, each with its replay."""
 
 import html
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from wbc_bench.files import folder_name
+from wbc_bench.installed import is_installed
 from wbc_bench.outcomes import TERMINATED, Outcome, SuccessRule
 from wbc_bench.results.analysis import (
     Evaluated,
@@ -56,7 +58,8 @@ def replay_command(protocol: str, controller: str, replicate: int, episode: int)
     """What writes it, in the folder of the records and the report."""
     run = _run(protocol, controller, replicate)
     page = replay_path(protocol, controller, replicate, episode)
-    return f"wbc-bench replay {run} --episode {episode} --results . -o {page}"
+    code = "" if is_installed(controller) else f" --controller {shlex.quote(controller)}"
+    return f"wbc-bench replay {run} --episode {episode} --results . -o {page}{code}"
 
 
 def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:

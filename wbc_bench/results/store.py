@@ -21,7 +21,7 @@ import pandas as pd
 import pyarrow as pa
 
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.files import folder_name
+from wbc_bench.files import folder_name, write_atomic
 from wbc_bench.outcomes import Outcome, SuccessRule
 from wbc_bench.readers import decode_parquet, is_file, read_bytes, read_json
 from wbc_bench.results.records import refuse_values
@@ -186,6 +186,24 @@ class ResultStore:
         """The folder of a run."""
         folder = self.root / "runs" / folder_name(protocol) / folder_name(controller)
         return folder / f"replicate_{replicate}"
+
+    def keep_protocol(self, name: str, protocol: Path, manifest: Path) -> None:
+        """Copy a user's own protocol, its manifest and its hash beside the runs.
+
+        Raises: StoreError, see `write_atomic`.
+        """
+        kept = self.protocol_path(name)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        pairs = [(protocol, kept)]
+        pairs += [(manifest.with_suffix(end), kept.with_suffix(end)) for end in (manifest.suffix, ".sha256")]
+        for source, copy in pairs:
+            data = read_bytes(source, "protocol", StoreError)
+            if not is_file(copy) or read_bytes(copy, "protocol", StoreError) != data:
+                write_atomic(copy, data)
+
+    def protocol_path(self, name: str) -> Path:
+        """Where the copy of a user's own protocol stands, if there is one."""
+        return self.root / "protocols" / f"{folder_name(name)}.toml"
 
     def unfinished(self) -> list[tuple[Path, int]]:
         """(folder, shards on disk) of runs that were interrupted."""

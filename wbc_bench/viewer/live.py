@@ -13,14 +13,16 @@ import numpy as np
 
 from wbc_bench.errors import BenchError
 from wbc_bench.robot import Scene
+from wbc_bench.viewer.guard import Guard
 from wbc_bench.viewer.moment import Moment
-from wbc_bench.viewer.panel import Panel
+from wbc_bench.viewer.panel import SPEEDS, Panel
 from wbc_bench.viewer.scene import SceneView, serving
 from wbc_bench.viewer.session import Session, hand_pose
 
 DRAW_PERIOD, PANEL_PERIOD = 0.04, 0.25  # [s]
 TRAIL_PIECES = 60
 GIZMO = 0.22  # [m]
+FARTHEST = 10.0  # [m] of a goal from the middle of the ground
 MAX_LAG = 0.5  # [s] behind real time that is made up for; more is let go
 
 
@@ -36,7 +38,7 @@ class LiveView:
             "/goal", scale=GIZMO, line_width=4.0, depth_test=False
         )
         self.panel = Panel(server, self)
-        self.gizmo.on_update(lambda _: self._goal_moved())
+        self.gizmo.on_update(lambda _: self.ask(self._goal_moved))
         self._pace: deque[tuple[float, float]] = deque(maxlen=100)  # (wall, simulated) [s]
         self._drawn: Moment | None = None
         self._surroundings: Scene | None = None
@@ -105,8 +107,14 @@ class LiveView:
         return (simulated_now - simulated) / max(wall_now - wall, 1e-9)
 
     def _step(self) -> None:
+        """One step; a controller or source that fails pauses the view, which says why and goes on."""
         self.waiting = False
-        self.session.step()
+        try:
+            self.session.step()
+        except BenchError as error:
+            self.paused = True
+            self.panel.say(str(error))
+            return
         self._pace.append((clocks.monotonic(), self.session.moment.time))
         self.panel.record(self.session.moment)
 
@@ -122,8 +130,8 @@ class LiveView:
             except Empty:
                 return
             try:
-                command()
                 self.panel.say("")
+                command()
             except BenchError as error:
                 self.panel.say(str(error))
 
@@ -138,12 +146,27 @@ class LiveView:
         self.panel.begin()
         self._draw()
 
+    def set_speed(self, speed: float) -> None:
+        """Simulated by elapsed time. Raises: BenchError when it is not one of the slider's."""
+        low, high = SPEEDS
+        if not low <= speed <= high:  # not so of NaN either
+            raise BenchError(f"speed {speed:g}, valid: {low:g} to {high:g}")
+        self.speed = speed
+
     def _goal_moved(self) -> None:
-        pos_w, wxyz = np.array(self.gizmo.position), np.array(self.gizmo.wxyz)
-        self.session.set_goal(pos_w, wxyz / np.linalg.norm(wxyz))
+        try:
+            pos_w, wxyz = np.array(self.gizmo.position, float), np.array(self.gizmo.wxyz, float)
+            turned = wxyz / np.linalg.norm(wxyz)
+            sound = pos_w.shape == (3,) and wxyz.shape == (4,) and bool(np.isfinite(turned).all())
+        except (TypeError, ValueError):
+            pos_w, turned, sound = np.zeros(3), np.zeros(4), False
+        if not sound or not (np.abs(pos_w) <= FARTHEST).all():  # not so of NaN either
+            self.gizmo.position, self.gizmo.wxyz = hand_pose(self.session.moment)
+            raise BenchError(f"a goal that is no pose within {FARTHEST:g} m")
+        self.session.set_goal(pos_w, turned)
         if self.waiting:
             self.paused = self.waiting = False
-        self.panel.show_goal(pos_w, wxyz)
+        self.panel.show_goal(pos_w, turned)
 
 
 def serve(
@@ -153,20 +176,21 @@ def serve(
     ready: Callable[[str], None],
     once: bool = False,
 ) -> None:
-    """Show a session in a page, whose address `ready` is given, and close it in the end.
+    """Show a session in a page, whose address with its token `ready` is given, and close it in the end.
 
     `once`: its time begins with the first goal, and it is shown no longer than it lasts.
 
     Raises: BenchError without viser, or when the port is taken.
     """
     try:
-        with serving(host, port) as server:
+        guard = Guard(remote=host == "0.0.0.0")
+        with serving(host, port, guard) as server:
             if server.get_port() != port:
                 raise BenchError(f"port {port} is in use, valid: another --port, e.g. {server.get_port()}")
             view = LiveView(server, session)
             if once:
                 view.wait()
-            ready(f"http://{'localhost' if host == '0.0.0.0' else host}:{port}")
+            ready(guard.address(host, port))
             view.run(lambda: once and not session.running)
     finally:
         session.close()

@@ -2,11 +2,12 @@
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from wbc_bench.registry import controllers
+from wbc_bench.errors import BenchError, UnknownNameError
+from wbc_bench.installed import controllers
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, rpy_from_matrix, wxyz_from_matrix
 from wbc_bench.sources import source_names
@@ -15,7 +16,12 @@ from wbc_bench.viewer.session import Session
 
 CHART_SECONDS, CHART_EVERY = 10.0, 5  # [s], control steps a point
 POSITION_COLOUR, ORIENTATION_COLOUR = "#2864c8", "#b0446e"
+SPEEDS = (0.1, 2.0)  # simulated by elapsed time
+PUSH_SPEEDS = (0.1, 1.0)  # [m/s]
 PUSHES = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}  # world x, y
+
+
+T = TypeVar("T")
 
 
 class Controllable(Protocol):
@@ -42,6 +48,10 @@ class Controllable(Protocol):
         """Begin a new episode, with another controller or source where one is given."""
         ...
 
+    def set_speed(self, speed: float) -> None:
+        """Set how much time is simulated per elapsed time."""
+        ...
+
     def step_once(self) -> None:
         """Pause, and take one control step."""
         ...
@@ -63,28 +73,28 @@ class Panel:
         ]
         self._pause = gui.add_button("Pause")
         steps = gui.add_button_group("Time", ("single step", "reset"))
-        self._speed = gui.add_slider("Speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
+        self._speed = gui.add_slider("Speed", min=SPEEDS[0], max=SPEEDS[1], step=0.1, initial_value=1.0)
         with gui.add_folder("Goal, in the world"):
             self._pos = gui.add_vector3("x y z [m]", (0.0, 0.0, 0.0), step=0.01)
             self._rpy = gui.add_vector3("r p y [deg]", (0.0, 0.0, 0.0), step=1.0)
         with gui.add_folder("Push"):
-            self._push_speed = gui.add_slider("m/s", min=0.1, max=1.0, step=0.1, initial_value=0.3)
+            low, high = PUSH_SPEEDS
+            self._push_speed = gui.add_slider("m/s", min=low, max=high, step=0.1, initial_value=0.3)
             pushes = gui.add_button_group("Direction", tuple(PUSHES))
         with gui.add_folder("Who and what"):
-            specs = sorted({*controllers(), session.spec})
-            self._spec = gui.add_dropdown("Controller", specs, initial_value=session.spec)
-            sources = [*dict.fromkeys([*source_names(), session.source_name])]
-            self._source = gui.add_dropdown("Source", sources, initial_value=session.source_name)
+            self._specs = {name: name for name in sorted({*controllers(), session.spec})}
+            self._spec = gui.add_dropdown("Controller", [*self._specs], initial_value=session.spec)
+            self._sources = {name: name for name in [*source_names(), session.source_name]}
+            self._source = gui.add_dropdown("Source", [*self._sources], initial_value=session.source_name)
         self._history: deque[tuple[float, float, float]] = deque(
             maxlen=round(CHART_SECONDS / session.period / CHART_EVERY)
         )
         self._steps = 0
 
         self._pause.on_click(lambda _: view.ask(self._toggle))
-        steps.on_click(
-            lambda event: view.ask(view.restart if event.target.value == "reset" else view.step_once)
-        )
-        self._speed.on_update(lambda _: setattr(view, "speed", float(self._speed.value)))
+        times = {"single step": view.step_once, "reset": view.restart}
+        steps.on_click(lambda event: view.ask(lambda: _chosen("Time", event.target.value, times)()))
+        self._speed.on_update(lambda _: view.ask(lambda: view.set_speed(_number(self._speed.value))))
         pushes.on_click(lambda event: view.ask(lambda: self._push(event.target.value)))
         # what the program itself writes into a field has no client
         for field in (self._pos, self._rpy):
@@ -125,6 +135,7 @@ class Panel:
 
     def show_goal(self, pos_w: Array, wxyz: Array) -> None:
         """Write where the gizmo is."""
+        self._goal = pos_w, wxyz
         self._pos.value = tuple(float(x) for x in np.round(pos_w, 3))
         self._rpy.value = tuple(float(x) for x in np.round(rpy_from_matrix(matrix_from_wxyz(wxyz)) * DEG, 1))
 
@@ -137,18 +148,41 @@ class Panel:
         self.update(float("nan"))
 
     def _push(self, direction: str) -> None:
-        self._view.session.push(np.array(PUSHES[direction]) * float(self._push_speed.value))
+        speed, (low, high) = _number(self._push_speed.value), PUSH_SPEEDS
+        if not low <= speed <= high:
+            raise BenchError(f"a push of {speed:g} m/s, valid: {low:g} to {high:g}")
+        self._view.session.push(np.array(_chosen("Direction", direction, PUSHES)) * speed)
 
     def _typed(self) -> None:
-        rot_w = matrix_from_rpy(np.array(self._rpy.value) / DEG)
-        self._view.set_goal(np.array(self._pos.value, dtype=float), wxyz_from_matrix(rot_w))
+        pos_w, rpy = (np.array([_number(x) for x in field.value]) for field in (self._pos, self._rpy))
+        if pos_w.shape != (3,) or rpy.shape != (3,) or not np.isfinite([pos_w, rpy]).all():
+            self.show_goal(*self._goal)
+            raise BenchError("a goal that is not six finite numbers")
+        self._view.set_goal(pos_w, wxyz_from_matrix(matrix_from_rpy(rpy / DEG)))
 
     def _choose(self) -> None:
         session = self._view.session
         try:
-            self._view.restart(self._spec.value, self._source.value)
+            # what arrives need not be one of the choices: nothing else is ever loaded
+            spec = _chosen("Controller", self._spec.value, self._specs)
+            source = _chosen("Source", self._source.value, self._sources)
+            self._view.restart(spec, source)
         finally:
             self._spec.value, self._source.value = session.spec, session.source_name
+
+
+def _number(value: Any) -> float:
+    """What a field holds. Raises: BenchError, it is no number."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise BenchError(f"'{value}' is not a number")
+    return float(value)
+
+
+def _chosen(label: str, value: Any, choices: dict[str, T]) -> T:
+    """What a choice stands for. Raises: UnknownNameError, it is not one that the page offers."""
+    if not isinstance(value, str) or value not in choices:
+        raise UnknownNameError("choice", str(value), choices, label)
+    return choices[value]
 
 
 def _add_chart(gui: Any, title: str, colour: str) -> Any:

@@ -21,12 +21,13 @@ def write_html(
     path: Path,
     protocol_name: str | None = None,
     progress: ShowProgress | None = None,
+    controller: str | None = None,
 ) -> Rerun:
     """Run an episode of a stored run again and write it as a page with time control.
 
     Raises: see `rerun`; BenchError without viser; StoreError when the file cannot be written.
     """
-    again = rerun(run, episode, protocol_name, progress)
+    again = rerun(run, episode, protocol_name, progress, controller)
     write_atomic(path, page(again).encode())
     return again
 

@@ -1,5 +1,6 @@
 """An episode of a stored run once more: it is deterministic, so that its record is enough to see it."""
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -8,14 +9,16 @@ import numpy as np
 import pyarrow as pa
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
+from wbc_bench.episodes.protocol import EvalProtocol, find_protocol, protocol_names
 from wbc_bench.errors import StoreError
 from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.evaluation.shard import episode_table
+from wbc_bench.installed import is_installed
 from wbc_bench.provenance import machine
+from wbc_bench.readers import is_file
 from wbc_bench.registry import load_controller, spec_of_replicate
-from wbc_bench.results.store import Run
+from wbc_bench.results.store import ResultStore, Run
 from wbc_bench.robot import Robot, load_robot
 from wbc_bench.rotations import matrix_from_wxyz
 from wbc_bench.viewer.moment import PUSH_SECONDS, Moment, moment_of
@@ -70,7 +73,11 @@ class Rerun:
 
 
 def rerun(
-    run: Run, episode: int, protocol_name: str | None = None, progress: ShowProgress | None = None
+    run: Run,
+    episode: int,
+    protocol_name: str | None = None,
+    progress: ShowProgress | None = None,
+    controller: str | None = None,
 ) -> Rerun:
     """Run one episode of a run again, and measure it as the run did.
 
@@ -78,14 +85,18 @@ def rerun(
     episodes of its shard at once may round otherwise alone; then its whole shard is run. Where the run comes
     from another processor, which rounds in its own way, there are no bits to be gained by that.
 
-    `protocol_name` names the .toml file of a protocol that is not a released one.
+    `protocol_name` names the .toml file of a protocol that is neither a released one nor kept beside the run.
+    `controller` is the spec of the controller that shall run, as the user gives it; None for the one of the
+    record, which must then be installed: a record comes from anywhere, and a file or module that it names is
+    not run for that alone.
 
     Raises:
-        StoreError: no such episode, or the protocol or manifest is not the run's.
+        StoreError: no such episode, the protocol or manifest is not the run's, or its controller is not an
+            installed one.
         UnknownNameError, ProtocolError, ManifestError, ControllerError: what the run needs is not here.
     """
     record = run.record
-    protocol, path = find_protocol(protocol_name or record.protocol)
+    protocol, path = find_protocol(protocol_name or _protocol_of(run))
     manifest, sha256 = read_manifest(protocol, manifest_path(path))
     for what, here, there in (
         ("protocol digest", protocol.digest, record.protocol_digest),
@@ -104,7 +115,12 @@ def rerun(
     shard = slice(start, min(start + record.shard_episodes, len(rows)))
     stored = run.episodes().iloc[[place]].to_dict("records")[0]
     robot = load_robot(protocol.robot)
-    spec = spec_of_replicate(record.controller, record.replicate)
+    if controller is None and not is_installed(record.controller):
+        raise StoreError(
+            f"'{run.path}' was made by '{record.controller}', which is not an installed controller: give "
+            f"`--controller {shlex.quote(record.controller)}` to run that code"
+        )
+    spec = spec_of_replicate(controller or record.controller, record.replicate)
 
     def of(part: slice) -> Rerun:
         row = place - part.start
@@ -115,6 +131,12 @@ def rerun(
     elsewhere = record.machine.get("processor") != machine().get("processor")
     whole = shard.stop - shard.start == 1
     return alone if not alone.differences or elsewhere or whole else of(shard)
+
+
+def _protocol_of(run: Run) -> str:
+    """The protocol of a run: a released one, or the user's own as it was kept beside the runs."""
+    kept = ResultStore(run.path.parents[3]).protocol_path(run.record.protocol)
+    return str(kept) if run.record.protocol not in protocol_names() and is_file(kept) else run.record.protocol
 
 
 def _watched(

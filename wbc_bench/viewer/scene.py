@@ -14,6 +14,7 @@ from wbc_bench.episodes.protocol import Success
 from wbc_bench.errors import BenchError, missing_extra
 from wbc_bench.robot import Robot, Scene
 from wbc_bench.rotations import wxyz_from_matrix
+from wbc_bench.viewer.guard import Guard, guarded
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 
 Array = NDArray[np.float64]
@@ -32,8 +33,10 @@ FLOOR = 0.002  # [m] above the ground, so that nothing flickers in it
 
 
 @contextmanager
-def serving(host: str = "127.0.0.1", port: int = 8080) -> Iterator[Any]:
+def serving(host: str = "127.0.0.1", port: int = 8080, guard: Guard | None = None) -> Iterator[Any]:
     """A viser server without a scene yet; on a port above, where the one asked for is taken.
+
+    It answers only whom the guard lets through; without one it is for nobody but this process.
 
     Raises: BenchError when viser is missing or cannot listen.
     """
@@ -43,7 +46,8 @@ def serving(host: str = "127.0.0.1", port: int = 8080) -> Iterator[Any]:
         raise BenchError(missing_extra("a page of the robot", "view", error)) from error
     with redirect_stdout(io.StringIO()):  # its banner, whatever `verbose` says
         try:
-            server = viser.ViserServer(host=host, port=port, verbose=False)
+            with guarded(guard or Guard(remote=False)):
+                server = viser.ViserServer(host=host, port=port, verbose=False)
         except OSError as error:
             raise BenchError(f"cannot listen on {host}, port {port}: {error}") from error
     try:

@@ -220,7 +220,7 @@ def sample_manifest(
     pos = target_set.pos_w[chosen].astype(np.float64)
     none, number = np.full(count, "", dtype=object), np.arange(count)
     return EpisodeManifest(
-        **neutral(count),
+        **neutral(count, push_step.shape[1]),
         replicate=np.zeros(count, np.int64),
         episode=number,
         stratum=np.array([STRATA[k] for k in target_set.stratum[chosen]], dtype=object),

@@ -1,0 +1,93 @@
+"""The live page answers whoever has its address, and no other page of the same browser."""
+
+import http.client
+from urllib.parse import urlsplit
+
+import pytest
+
+from live_page import Served
+from wbc_bench.viewer.guard import Guard
+
+
+def get(page: Served, path: str, **headers: str) -> tuple[int, str, str]:
+    """Status, body and cookie of a request to the page."""
+    place = urlsplit(page.url)
+    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=20)
+    names = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request("GET", path, headers={"Host": place.netloc} | names)
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode(errors="replace"), answer.getheader("Set-Cookie") or ""
+
+
+def test_the_token_opens_the_page_and_a_cookie_keeps_it_open(served: Served) -> None:
+    place = urlsplit(served.url)
+    status, body, cookie = get(served, f"/?{place.query}")
+    assert status == 200 and "<html" in body
+    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
+    mine = cookie.split(";")[0]
+    assert get(served, "/", Cookie=mine)[0] == 200
+    assert get(served, "/", Cookie=f"other=1; {mine}")[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("headers", "words"),
+    [
+        ({}, "token"),
+        ({"Cookie": "wbc_bench_80=x"}, "token"),
+        ({"Host": "evil.example"}, "host 'evil.example'"),
+        ({"Host": "localhost.evil.example:80"}, "is not the address of this page"),
+        ({"Origin": "http://evil.example"}, "origin 'http://evil.example'"),
+        ({"Origin": "null"}, "origin 'null'"),
+    ],
+)
+def test_everybody_else_is_refused(served: Served, headers: dict[str, str], words: str) -> None:
+    token = "" if words == "token" else f"?{urlsplit(served.url).query}"
+    status, body, cookie = get(served, f"/{token}", **headers)
+    assert status == 403 and words in body and not cookie
+
+
+def test_a_socket_needs_the_origin_of_the_page_and_the_token(served: Served) -> None:
+    sync = pytest.importorskip("websockets.sync.client")
+    from websockets.exceptions import InvalidStatus
+
+    place = urlsplit(served.url)
+    cookie = get(served, f"/?{place.query}")[2].split(";")[0]
+
+    def connect(origin: str | None, cookie: str | None):
+        headers = {"Cookie": cookie} if cookie else {}
+        return sync.connect(
+            f"ws://{place.netloc}", origin=origin, additional_headers=headers, subprotocols=["viser-v1.1.1"]
+        )
+
+    here = f"http://{place.netloc}"
+    with connect(here, cookie):
+        pass
+    port = (place.port or 0) + 1
+    for origin, given in (
+        ("http://evil.example", cookie),
+        (f"http://{place.hostname}:{port}", cookie),  # another server of this machine
+        (None, cookie),
+        (here, None),
+    ):
+        with pytest.raises(InvalidStatus) as refused, connect(origin, given):
+            pass
+        assert refused.value.response.status_code == 403
+
+
+def test_a_remote_page_is_opened_by_address_or_name_but_not_by_another_s_name() -> None:
+    import socket
+
+    guard = Guard(remote=True)
+    path = "/?" + urlsplit(guard.address("0.0.0.0", 8080)).query
+
+    def refused(host: str) -> str:
+        from websockets.datastructures import Headers
+
+        return guard.refusal(path, Headers({"Host": host}))
+
+    assert not any(map(refused, ("192.168.1.7:8080", "[fe80::1]:8080", f"{socket.gethostname()}:8080")))
+    assert "host" in refused("rebound.example:8080")
+
+
+def test_two_pages_have_two_tokens() -> None:
+    assert Guard(False).address("127.0.0.1", 1) != Guard(False).address("127.0.0.1", 1)

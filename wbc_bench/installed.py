@@ -1,0 +1,15 @@
+"""Which controllers are installed, without loading any of them."""
+
+from importlib.metadata import EntryPoint, entry_points
+
+ENTRY_POINTS = "wbc_bench.controllers"
+
+
+def controllers() -> dict[str, EntryPoint]:
+    """Installed controllers by name."""
+    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+
+def is_installed(spec: str) -> bool:
+    """Whether a spec names an installed controller, or a variant of one, and not code of a user."""
+    return spec.partition(":")[0] in controllers()
