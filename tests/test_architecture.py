@@ -20,7 +20,7 @@ LAYERS = (
     ("controller",),
     ("episodes",),
     ("robot", "results", "tensors"),
-    ("provenance", "progress", "outcomes", "files", "readers", "schema", "installed"),
+    ("provenance", "progress", "outcomes", "files", "readers", "schema", "installed", "isolation"),
     ("rotations", "randomness", "errors"),
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")

@@ -101,6 +101,19 @@ class ProtocolAware(Protocol):
 
 
 @runtime_checkable
+class UsesRandomness(Protocol):
+    """A controller that draws at random, from a stream of its own.
+
+    Draws from the global generators of `random`, NumPy and PyTorch are repeatable as well: for the time of a
+    controller's code they are seeded anew for every shard, and restored afterwards.
+    """
+
+    def seed(self, rng: np.random.Generator) -> None:
+        """Called before each reset; the stream depends on the episodes alone."""
+        ...
+
+
+@runtime_checkable
 class Exportable(Protocol):
     """A controller that can be written to a file for other runtimes."""
 

@@ -48,6 +48,8 @@ class SourceError(BenchError):
     """A source of targets that cannot be read or opened, or a target that is none."""
 
 
+LONGEST_TEXT = 500  # characters of somebody else's message
+
 _PACKAGES = {  # distribution of a module that has another name
     "imageio_ffmpeg": "imageio-ffmpeg",
     "pink": "pin-pink",
@@ -80,6 +82,11 @@ def fault_of(error: BaseException) -> str:
         for frame in traceback.extract_tb(error.__traceback__)
         if not Path(frame.filename).is_relative_to(Path(__file__).parent)
     ]
-    text = " ".join(str(error).split())
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # an exception whose text raises
+        text = "(it cannot say what)"
+    if len(text) > LONGEST_TEXT:
+        text = f"{text[:LONGEST_TEXT]}..."
     hint = "; a signal that `info.signals` does not declare is None" if "'NoneType' object" in text else ""
     return f"{type(error).__name__}: {text}{hint}" + (f" ({' > '.join(frames[-4:])})" if frames else "")

@@ -3,13 +3,15 @@
 import importlib
 import pickle
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from wbc_bench import provenance
 from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, SeededFactory
-from wbc_bench.errors import BenchError, ControllerError, UnknownNameError
+from wbc_bench.errors import BenchError, ControllerError, UnknownNameError, fault_of
 from wbc_bench.installed import controllers
+from wbc_bench.isolation import GlobalRandomness
 from wbc_bench.robot import Robot
 
 ControllerFactory = Callable[[Robot], Controller]
@@ -26,20 +28,23 @@ def load_controller(spec: str, robot: Robot) -> Controller:
         UnknownNameError: no installed controller of that name (with the nearest names).
         ControllerError: it cannot be imported or built, or declares a signal that does not exist.
     """
+    had_torch = "torch" in sys.modules
+    controller = _load(spec, robot)
+    # imported by this controller, it was not seeded yet when the controller was made
+    return controller if had_torch or "torch" not in sys.modules else _load(spec, robot)
+
+
+def _load(spec: str, robot: Robot) -> Controller:
     name, _, rest = spec.partition(":")
     installed = controllers()
-    try:
+    with _building(spec):
         if name in installed:
             controller = installed[name].load()(robot, rest)
         elif rest:
             controller = _load_attribute(name, rest)(robot)
         else:
             raise UnknownNameError("controller", spec, installed, "--controller; or give module:attribute")
-    except BenchError:
-        raise
-    except ImportError as error:
-        raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
-    return _checked(controller, spec)
+        return _checked(controller, spec)
 
 
 def build_controller(source: str | bytes, robot: Robot) -> Controller:
@@ -49,11 +54,26 @@ def build_controller(source: str | bytes, robot: Robot) -> Controller:
     """
     if isinstance(source, str):
         return load_controller(source, robot)
-    found = pickle.loads(source)
-    name = getattr(found, "__name__", type(found).__name__)
-    if isinstance(found, type) or not hasattr(found, "act"):
-        found = found(robot)
-    return _checked(found, name)
+    with _building("handed over"):
+        found = pickle.loads(source)
+        name = getattr(found, "__name__", type(found).__name__)
+        if isinstance(found, type) or not hasattr(found, "act"):
+            found = found(robot)
+        return _checked(found, name)
+
+
+@contextmanager
+def _building(spec: str) -> Iterator[None]:
+    """What a user's code raises while a controller is made of it, in one line; global seeds are its own."""
+    try:
+        with GlobalRandomness(0).own():
+            yield
+    except (BenchError, KeyboardInterrupt):
+        raise
+    except ImportError as error:
+        raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
+    except BaseException as error:
+        raise ControllerError(f"controller '{spec}' cannot be made: {fault_of(error)}") from error
 
 
 def pack_controller(controller: object) -> bytes:

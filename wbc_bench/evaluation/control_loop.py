@@ -7,14 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.controller import Controller, JointCommand, ProtocolAware, Target
+from wbc_bench.controller import Controller, JointCommand, ProtocolAware, Target, UsesRandomness
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, ControllerError, fault_of
 from wbc_bench.evaluation.delays import LateStates, physics_steps
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation, State
+from wbc_bench.isolation import GlobalRandomness
 from wbc_bench.outcomes import Outcome
+from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, Scene
 
 RUNNING = ""
@@ -50,9 +52,8 @@ class ControlLoop:
                 f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "
                 f"protocol {protocol.name} asks for {period:g} s"
             )
-        if isinstance(controller, ProtocolAware):
-            controller.prepare(protocol)
         self._controller, self._protocol, self._rows = controller, protocol, rows
+        self._randomness = GlobalRandomness(int(rows.noise_key[0]))
         self.simulation = Simulation(protocol, rows, scene)
         self.sensors = Sensors(protocol, rows, controller.info.signals)
         self._push_step = np.full(rows.push_time.shape, -1)
@@ -70,6 +71,9 @@ class ControlLoop:
             LateStates[State](physics_steps(delay, physics.timestep), physics.decimation)
             for delay in (rows.observation_delay, rows.odometry_delay)
         ]
+        if isinstance(controller, ProtocolAware):
+            with self._blamed("prepare"):
+                controller.prepare(protocol)
         self._see()
 
     def run(self) -> Iterator[StepResult]:
@@ -91,8 +95,12 @@ class ControlLoop:
 
     def reset(self, target: Target) -> None:
         """Tell the controller what it begins with."""
+        controller = self._controller
+        if isinstance(controller, UsesRandomness):
+            with self._blamed("seed"):
+                controller.seed(stream(int(self._rows.noise_key[0]), "controller"))
         with self._blamed("reset"):
-            self._controller.reset(self._rows.episode, self.observation, target)
+            controller.reset(self._rows.episode.copy(), self.observation, target)
 
     def advance(self, target: Target) -> StepResult:
         """One control step towards a target.
@@ -125,10 +133,11 @@ class ControlLoop:
     def _blamed(self, method: str) -> Iterator[None]:
         """What a controller raises, `SystemExit` too, in one line: its own frames, step and episodes."""
         try:
-            yield
-        except BenchError:
+            with self._randomness.own():
+                yield
+        except (BenchError, KeyboardInterrupt):
             raise
-        except (Exception, SystemExit) as error:
+        except BaseException as error:
             episodes = self._rows.episode
             raise ControllerError(
                 f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "

@@ -1,5 +1,7 @@
 """What a controller may see: measurements with the protocol's noise, and the target in the base frame."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,7 @@ from wbc_bench.robot.kinematics import ArmKinematics
 from wbc_bench.rotations import matrix_from_rotvec, matrix_from_wxyz, rho6
 
 Array = NDArray[np.float64]
+T = TypeVar("T", bound=tuple)
 _WIDTHS = {  # signals with noise, in the order of their columns
     "base_ang_vel": 3,
     "gravity": 3,
@@ -121,7 +124,14 @@ class Sensors:
                 foot_pos_b=(state.foot_pos_w - state.base_pos_w[:, None]) @ rot_w,
                 **self._rates(state),
             )
-        return Observation(time, active.copy(), proprioception, ee_pose, base_pose, privileged)
+        return Observation(
+            time,
+            active.copy(),
+            proprioception and _locked(proprioception),
+            ee_pose and _locked(ee_pose),
+            base_pose and _locked(base_pose),
+            privileged and _locked(privileged),
+        )
 
     def _rates(self, state: State) -> dict[str, Array]:
         """Finite differences to the state of the observation before."""
@@ -151,7 +161,15 @@ class Sensors:
         if self._drift is not None:
             believed = believed + self._drift[step]
         pos_b = np.einsum("nji,nj->ni", base, pos_w - believed)
-        return Target(pos_b, np.swapaxes(base, 1, 2) @ rot_w)
+        return _locked(Target(pos_b, np.swapaxes(base, 1, 2) @ rot_w))
+
+
+def _locked(part: T) -> T:
+    """A named tuple of arrays that cannot be written to: some are the harness's own."""
+    views = [array.view() for array in part]
+    for view in views:
+        view.flags.writeable = False
+    return type(part)(*views)
 
 
 def _random_walks(protocol: EvalProtocol, rows: EpisodeManifest) -> Array:

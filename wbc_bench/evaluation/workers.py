@@ -8,6 +8,7 @@ import resource
 import signal
 import threading
 import time
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ import pyarrow as pa
 
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.errors import BenchError, ControllerError, UnknownNameError, missing_extra
+from wbc_bench.errors import BenchError, ControllerError, UnknownNameError, fault_of, missing_extra
 from wbc_bench.evaluation.shard import evaluate_shard
 from wbc_bench.results.store import ShardCost
 
@@ -80,6 +81,8 @@ def _work(task: Task) -> Result:
         episodes = evaluate_shard(task.controller, task.protocol, task.rows, task.software)
     except BenchError as error:  # every subclass as one that survives pickling
         raise ControllerError(str(error)) from None
+    except Exception as error:  # a fault of ours; the exception itself may not survive it
+        raise RuntimeError("".join(traceback.format_exception(error))) from None
     rss = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # [MiB]
     return Result(task.run, task.shard, episodes, started, ShardCost(time.time() - started, rss))
 
@@ -87,7 +90,13 @@ def _work(task: Task) -> Result:
 def _work_for(client: int, task: Task) -> Result:
     """One shard, on a worker that does not outlive its client."""
     _leave_with(client)
-    return _work(task)
+    try:
+        return _work(task)
+    except KeyboardInterrupt as error:  # interrupts are the client's: this one was raised by somebody's code
+        raise ControllerError(
+            f"controller '{task.controller if isinstance(task.controller, str) else 'handed over'}' raised "
+            f"{fault_of(error)}"
+        ) from None
 
 
 @cache

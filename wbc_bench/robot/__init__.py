@@ -104,7 +104,7 @@ def load_robot(config: RobotConfig = RobotConfig()) -> Robot:  # noqa: B008  (fr
     joints = facts.joints
     gains = np.array([gain_of(facts, joint, config) for joint in joints])
     scale = facts.action_scale
-    return Robot(
+    robot = Robot(
         facts=facts,
         config=config,
         default_q=np.array([facts.default_qpos.get(joint.name, 0.0) for joint in joints]),
@@ -117,3 +117,7 @@ def load_robot(config: RobotConfig = RobotConfig()) -> Robot:  # noqa: B008  (fr
         kd=gains[:, 1],
         armature=np.array([joint.armature for joint in joints]),
     )
+    for value in vars(robot).values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False  # one robot serves every controller of a process
+    return robot

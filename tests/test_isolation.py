@@ -1,0 +1,183 @@
+"""A controller's code neither disturbs others nor is disturbed: arrays, global random streams, faults."""
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tiny_protocol import write_tiny
+from wbc_bench.errors import ControllerError
+from wbc_bench.evaluation.evaluate import evaluate
+from wbc_bench.isolation import GlobalRandomness
+from wbc_bench.robot import load_robot
+
+HEAD = """
+import random
+import numpy as np
+from wbc_bench.controller import SIGNALS, ControllerInfo, JointCommand
+
+class Mine:
+    info = ControllerInfo("mine", frozenset(SIGNALS), 0.02, "test")
+
+    def __init__(self, robot):
+        self.robot, self.q = robot, robot.default_q
+
+    def reset(self, episodes, obs, target):
+        pass
+
+    def act(self, obs, target):
+        return JointCommand(np.tile(self.q, (len(obs.active), 1)) + self.more(obs, target))
+
+    def more(self, obs, target):
+        return 0.0
+"""
+
+
+def controller(folder: Path, name: str, body: str) -> str:
+    path = folder / f"{name}.py"
+    path.write_text(HEAD + "".join(f"    {line}\n" for line in body.strip("\n").splitlines()))
+    return f"{path}:Mine"
+
+
+def rows(spec: str, protocol: Path, **options):
+    return evaluate(spec, str(protocol), **options).episodes
+
+
+DRAWS = """
+def more(self, obs, target):
+    return 0.1 * random.random() + 0.1 * np.random.rand()
+"""
+OWN = """
+def seed(self, rng):
+    self.rng = rng
+
+def more(self, obs, target):
+    return 0.1 * self.rng.random()
+"""
+
+
+@pytest.mark.parametrize("body", [DRAWS, OWN], ids=["global generators", "its own stream"])
+def test_random_controllers_are_repeatable(tmp_path: Path, body: str) -> None:
+    """Whatever was drawn before, by one worker or by two; and the draws of the caller stay what they were."""
+    protocol = write_tiny(tmp_path, replicates=2, episodes=6)
+    spec = controller(tmp_path, f"draws_{len(body)}", body)
+    random.seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    wanted = random.random(), np.random.rand()  # noqa: NPY002
+    first = rows(spec, protocol)
+    random.seed(5)
+    np.random.seed(5)  # noqa: NPY002
+    again = rows(spec, protocol)
+    assert (random.random(), np.random.rand()) == wanted  # noqa: NPY002
+    assert first.equals(again)
+    assert first.equals(rows(spec, protocol, workers=2))
+    assert len(set(first["action_variation"])) > 1  # it does draw, and otherwise in other shards
+
+
+TORCH = """
+import torch
+
+def __init__(self, robot):
+    self.q, self.weight = robot.default_q, self.torch.rand(1).item()
+
+def more(self, obs, target):
+    return 0.1 * self.weight * self.torch.rand(1).item()
+"""
+
+
+def test_torch_draws_the_same_whoever_imported_it(tmp_path: Path) -> None:
+    """By itself it begins at the entropy of the machine."""
+    torch = pytest.importorskip("torch")
+    protocol, spec = write_tiny(tmp_path), controller(tmp_path, "draws_torch", TORCH)
+    code = (
+        "import sys\n{}\nfrom wbc_bench import evaluate\n"
+        f"print(evaluate({spec!r}, {str(protocol)!r}).episodes['action_variation'].tolist())"
+    )
+    found = [
+        subprocess.run([sys.executable, "-c", code.format(first)], capture_output=True, text=True).stdout
+        for first in ("", "import torch; torch.manual_seed(9)")
+    ]
+    assert found[0] == found[1] != ""
+    torch.manual_seed(4)
+    expected = torch.rand(1).item()
+    torch.manual_seed(4)
+    with GlobalRandomness(1).own():
+        torch.rand(7)
+    assert torch.rand(1).item() == expected
+
+
+def test_streams_go_on_where_they_were_left() -> None:
+    mine = GlobalRandomness(7)
+    with mine.own():
+        a = random.random()
+    random.random()
+    with mine.own():
+        b = random.random()
+    again = GlobalRandomness(7)
+    with again.own():
+        assert [random.random(), random.random()] == [a, b]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "self.robot.default_q += 1",
+        "self.robot.kp[0] = 0",
+        "obs.proprioception.joint_pos[:] = 0",
+        "obs.base_pose.pos_w[:] = 0",
+        "obs.privileged.friction[:] = 9",
+        "obs.ee_pose.pos_b[:] = 0",
+        "target.pos_b[:] = 0",
+    ],
+)
+def test_what_is_handed_out_cannot_be_written_to(tmp_path: Path, line: str) -> None:
+    before = load_robot().default_q.copy()
+    body = f"def more(self, obs, target):\n    {line}\n    return 0.0"
+    spec = controller(tmp_path, f"writes_{abs(hash(line))}", body)
+    with pytest.raises(ControllerError, match=r"control step 0 of episodes 0 to 5: ValueError: .*read-only"):
+        rows(spec, write_tiny(tmp_path))
+    np.testing.assert_array_equal(load_robot().default_q, before)
+
+
+def test_episode_numbers_are_a_copy(tmp_path: Path) -> None:
+    spec = controller(tmp_path, "renumbers", "def reset(self, episodes, obs, target):\n    episodes[:] = 99")
+    assert sorted(rows(spec, write_tiny(tmp_path))["episode"].unique()) == list(range(6))
+
+
+FAULTS = {
+    "needs_two": "class Odd(Exception):\n    def __init__(self, a, b):\n        self.b = b\nraise Odd(1, 2)",
+    "locked": "import threading\nerror = ValueError('locked')\nerror.lock = threading.Lock()\nraise error",
+    "mute": "class Mute(Exception):\n    def __str__(self):\n        raise RuntimeError\nraise Mute",
+    "huge": "raise ValueError('x' * 10_000_000)",
+    "nested": "try:\n    1 / 0\nexcept ZeroDivisionError as cause:\n    raise LookupError('in') from cause",
+    "leaves": "raise SystemExit(0)",
+    "base": "class Odder(BaseException):\n    pass\nraise Odder('of its own kind')",
+    "generator": "raise GeneratorExit('closing')",
+}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("kind", FAULTS)
+def test_any_exception_comes_back_as_the_user_s_own_frames(tmp_path: Path, kind: str, workers: int) -> None:
+    body = "def more(self, obs, target):\n" + "".join(f"    {line}\n" for line in FAULTS[kind].splitlines())
+    spec = controller(tmp_path, f"fails_{kind}_{workers}", body)
+    with pytest.raises(ControllerError) as caught:
+        rows(spec, write_tiny(tmp_path), workers=workers)
+    said = str(caught.value)
+    assert "'mine' failed in `act` at control step 0 of episodes 0 to 5" in said
+    assert f"fails_{kind}_{workers}.py" in said and "in more" in said and len(said) < 1200
+
+
+def test_an_interrupt_raised_by_a_controller_is_its_fault_in_a_worker(tmp_path: Path) -> None:
+    spec = controller(tmp_path, "interrupts", "def more(self, obs, target):\n    raise KeyboardInterrupt")
+    with pytest.raises(ControllerError, match=r"interrupts.py:Mine' raised KeyboardInterrupt"):
+        rows(spec, write_tiny(tmp_path), workers=2)
+
+
+def test_a_factory_that_fails_is_one_line(tmp_path: Path) -> None:
+    spec = controller(tmp_path, "unmade", "def __init__(self, robot):\n    raise OSError('no such weights')")
+    with pytest.raises(ControllerError, match=r"cannot be made: OSError: no such weights \(unmade.py:\d+ in"):
+        rows(spec, write_tiny(tmp_path))

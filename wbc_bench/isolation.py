@@ -1,0 +1,58 @@
+"""The global random streams of Python, NumPy and PyTorch, apart for each controller.
+
+Code of a controller may draw from them without knowing. Its results must then depend neither on what ran
+before in the process nor on how many workers there are, and must not change what others draw.
+"""
+
+# ruff: noqa: NPY002  (the legacy generator is what is kept apart here)
+import random
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+
+class GlobalRandomness:
+    """Streams of one user of the global generators, which begin at a seed and go on where they were left.
+
+    PyTorch's begins at the seed when it is imported before they are used; whoever imports it inside finds it
+    unseeded until the next time. So `registry` makes a controller that imports it a second time.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._inside: dict[str, Any] | None = None
+
+    @contextmanager
+    def own(self) -> Iterator[None]:
+        """Inside, the global generators are this user's; afterwards they are as they were."""
+        outside = _states()
+        try:
+            if self._inside is None:
+                random.seed(self._seed)
+                np.random.seed(self._seed % 2**32)
+                self._inside = {name: state for name, state in _states().items() if name != "torch"}
+            self._restore(self._inside)
+            yield
+        finally:
+            self._inside = _states()
+            self._restore(outside)
+
+    def _restore(self, states: dict[str, Any]) -> None:
+        random.setstate(states["random"])
+        np.random.set_state(states["numpy"])
+        torch: Any = sys.modules.get("torch")
+        if "torch" in states:
+            torch.random.set_rng_state(states["torch"])
+        elif torch is not None:  # imported since; by itself it begins at the entropy of the machine
+            torch.random.manual_seed(self._seed)
+
+
+def _states() -> dict[str, Any]:
+    states = {"random": random.getstate(), "numpy": np.random.get_state()}
+    torch = sys.modules.get("torch")  # never imported for this alone: it takes a second
+    if torch is not None:
+        states["torch"] = torch.random.get_rng_state()
+    return states
