@@ -1,5 +1,6 @@
 """Protocol files: what is refused, with which words, and what a digest covers."""
 
+import math
 import re
 import shutil
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import wbc_bench
-from wbc_bench.episodes.protocol import find_protocol, protocol_names, read_protocol
+from wbc_bench.episodes.protocol import Termination, find_protocol, protocol_names, read_protocol
 from wbc_bench.errors import ProtocolError, UnknownNameError
 from wbc_bench.files import PROTOCOLS
 
@@ -184,3 +185,21 @@ def test_released_protocols_are_found(tmp_path, where):
 def test_an_editable_install_finds_those_of_its_checkout():
     assert PROTOCOLS in (ROOT / "protocols", Path(wbc_bench.__file__).parent / "protocols")
     assert (PROTOCOLS / "ablation_v1.parquet").is_file() and list((PROTOCOLS / "scripts").glob("*.toml"))
+
+
+def test_a_tilt_limit_is_a_cosine_up_to_pi_and_none_beyond():
+    assert Termination(tilt=math.pi / 3).min_upright == pytest.approx(0.5)
+    for tilt in (math.pi, 3.2, 2 * math.pi, 1e9):
+        assert Termination(tilt=tilt).min_upright == -math.inf
+
+
+def test_postures_of_a_protocol_without_a_tilt_limit_are_valid():
+    from wbc_bench.episodes.static_solver import static_solver
+    from wbc_bench.robot import RobotConfig
+
+    solver = static_solver(RobotConfig(), 0.0, 2 * math.pi / 0.9, 0.3)
+    qpos = solver.model.qpos0.copy()
+    qpos[3:7] = [math.cos(0.2), 0.0, math.sin(0.2), 0.0]  # 0.4 rad forward
+    assert "base too tilted or too low" not in solver.violations(qpos)
+    strict = static_solver(RobotConfig(), 0.0, 0.3, 0.3)
+    assert "base too tilted or too low" in strict.violations(qpos)

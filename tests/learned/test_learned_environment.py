@@ -331,6 +331,19 @@ def test_endings():
     assert not env.step(torch.zeros(N, 14)).done.any()  # the reset has cleared the engine's warning
 
 
+@pytest.mark.parametrize("tilt", [np.pi, 6.28, 10.0, 1e9])
+def test_no_tilt_is_beyond_pi(tilt):
+    """A large limit switches the termination off, also where its cosine comes round again."""
+    protocol = coarse()
+    limits = msgspec.structs.replace(protocol.termination, tilt=tilt, base_height=0.0, illegal_contact=False)
+    env = environment(msgspec.structs.replace(protocol, termination=limits))
+    env.begin_rollout(0, 1)
+    env._episode.step.fill_(0)
+    env._backend._state["qpos"][:, 2] = 1.5  # in the air
+    env._backend._state["qpos"][0, 3:7] = [0.0, 0.0, 1.0, 0.0]  # upside down
+    assert not env.step(torch.zeros(N, 14)).done.any()
+
+
 def test_success_is_the_last_second_inside():
     """Held for 50 steps at the time-out counts, for 49 not."""
     env = environment()

@@ -206,6 +206,15 @@ class Termination(_Table, frozen=True):
     base_height: NonNegative = 0.30  # [m]
     illegal_contact: bool = True  # base, shank or arm on the ground
 
+    @property
+    def min_upright(self) -> float:
+        """Smallest cosine between the two verticals that does not end an episode.
+
+        A cosine comes round again beyond pi, where no tilt is, and rounding may push it below -1: from pi on
+        the limit is -inf.
+        """
+        return math.cos(self.tilt) if self.tilt < math.pi else -math.inf
+
 
 class Success(_Table, frozen=True):
     """Both errors stay inside the tolerances throughout the final window. Source: paper, section IV-B."""

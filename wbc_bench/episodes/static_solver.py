@@ -65,7 +65,7 @@ class StaticSolver:
     def __init__(self, robot: Robot, com_margin: float, tilt: float, base_height: float) -> None:
         """`com_margin` [m] inside the soles; `tilt` [rad] and `base_height` [m] at which an episode ends."""
         self.robot, self.com_margin = robot, com_margin
-        self.max_tilt, self.min_height = TILT_SHARE * tilt, base_height + HEIGHT_MARGIN
+        self.max_tilt, self.min_height = min(TILT_SHARE * tilt, np.pi), base_height + HEIGHT_MARGIN
         self.model = robot.model()
         ground = self.model.geom("ground").id
         self.model.geom_margin[ground] = CLEARANCE  # contacts this far away are reported

@@ -169,7 +169,7 @@ class ControlLoop:
 def _terminations(protocol: EvalProtocol, state: State) -> list[tuple[Outcome, NDArray[np.bool_]]]:
     """Ways an episode ends early; the first that holds counts. Source: the paper, made deterministic."""
     limits = protocol.termination
-    tilted = state.base_rot_w[:, 2, 2] < np.cos(min(limits.tilt, np.pi))  # no tilt is beyond pi
+    tilted = state.base_rot_w[:, 2, 2] < limits.min_upright
     low = state.base_pos_w[:, 2] < limits.base_height
     return [
         (Outcome.INVALID, state.diverged),

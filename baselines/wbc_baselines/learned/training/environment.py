@@ -217,7 +217,7 @@ class Environment:
         episode.d_ref[:] = advance(episode.d_ref, episode.decay, protocol.control_period)
 
         limits, success = protocol.termination, protocol.success
-        fell = (derived.upright < np.cos(limits.tilt)) | (state.qpos[:, 2] < limits.base_height)
+        fell = (derived.upright < limits.min_upright) | (state.qpos[:, 2] < limits.base_height)
         terminated = fell | (state.ground_contact & limits.illegal_contact) | state.diverged
         done = terminated | (episode.step >= protocol.num_steps)
         time_out = done & ~terminated
