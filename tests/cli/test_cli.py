@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -15,6 +17,7 @@ from tiny_protocol import write_tiny
 from user_controllers import write_controller
 from wbc_bench.cli.main import main
 from wbc_bench.episodes.manifest import manifest_path
+from wbc_bench.episodes.protocol import read_protocol
 
 
 @pytest.fixture
@@ -63,6 +66,45 @@ def test_altered_manifest(capsys, tiny):
     data[100] ^= 1
     path.write_bytes(data)
     assert "does not match its hash" in fails(capsys, "eval", "--controller", "hold", "--protocol", tiny)
+
+
+def hint(line: str) -> list[str]:
+    """The words of the command that a message gives in backticks, without the program."""
+    (command,) = re.findall("`([^`]*)`", line)
+    return shlex.split(command)[1:]
+
+
+def test_the_commands_after_an_evaluation_without_a_manifest_work(capsys, tmp_path):
+    """In a folder and under names that a shell would split."""
+    folder = tmp_path / "my protocols"
+    folder.mkdir()
+    path = write_tiny(folder, replicates=1, episodes=2).rename(folder / "another name.toml")
+    (folder / "tiny.parquet").unlink()
+    line = fails(capsys, "eval", "--controller", "hold", "--protocol", path)
+    assert "does not exist" in line
+    main(hint(line))
+    capsys.readouterr()
+    evaluate(path, folder / "out")
+    told = capsys.readouterr().out
+    main(hint(told.splitlines()[-1]))
+    assert (folder / "out" / "report.html").exists()
+    capsys.readouterr()
+    path.write_text(path.read_text().replace("horizon = 0.2", "horizon = 0.3"))
+    line = fails(capsys, "eval", "--controller", "hold", "--protocol", path)
+    main(hint(line))
+    evaluate(path, folder / "other")
+
+
+def test_the_manifest_of_a_released_protocol_is_made_by_its_name(tmp_path, monkeypatch):
+    from wbc_bench.episodes import manifest
+    from wbc_bench.errors import ManifestError
+
+    monkeypatch.setattr(manifest, "PROTOCOLS", tmp_path)
+    path = write_tiny(tmp_path)
+    manifest_path(path).unlink()
+    with pytest.raises(ManifestError) as error:
+        manifest.read_manifest(read_protocol(path), manifest_path(path))
+    assert hint(str(error.value)) == ["protocol", "freeze", "tiny"]
 
 
 def test_manifest_of_another_protocol(capsys, tiny):
@@ -257,6 +299,19 @@ def test_eval_report_compare_list(capsys, tiny, tmp_path):
     assert out / "report.html" in first and list(out.glob("figures/*.svg")) and list(out.glob("tables/*.tex"))
     main(["report", "--results", str(out)])
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == first
+
+
+def test_compare_finds_runs_by_name_and_by_file(capsys, tiny, tmp_path):
+    out = tmp_path / "out"
+    evaluate(tiny, out)
+    capsys.readouterr()
+    main(["compare", "hold", "hold", "--protocol", "tiny", "--results", str(out)])
+    by_name = capsys.readouterr().out
+    main(["compare", "hold", "hold", "--protocol", str(tiny), "--results", str(out)])
+    assert capsys.readouterr().out == by_name
+    line = fails(capsys, "compare", "hold", "hold", "--protocol", "tinny", "--results", out)
+    assert "'tinny'" in line and "did you mean tiny?" in line and "valid: tiny" in line
+    assert str(out) in line
 
 
 def listed_controllers(text: str) -> list[list[str]]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import fields, is_dataclass
 
 import pytest
+import tyro
 
 UNIT = re.compile(r"\[(1|s|nat|N m|control steps|control steps per environment)\]")
 COUNT = re.compile(r"^(Number|Seed|Index|TCP port) of \w+")
@@ -84,3 +85,14 @@ def check_shown(words: tuple[str, ...], command: type, main: Callable, capsys: p
             assert first in shown, f"--{option} of {' '.join(words)}"
             for unit in UNIT.finditer(text):
                 assert unit.group() in shown, f"{unit.group()} of --{option}"
+
+
+def check_parses(words: list[str], union: object, main: Callable, capsys: pytest.CaptureFixture) -> None:
+    """Assert that the command line accepts the words of a command; it is not run."""
+    try:
+        if words and words[0].startswith("--"):  # answered by the program itself, e.g. --version
+            main(words)
+        elif words:
+            tyro.cli(typing.cast(typing.Any, union), args=words)
+    except SystemExit as stop:
+        assert not stop.code, capsys.readouterr()

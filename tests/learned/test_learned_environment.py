@@ -35,7 +35,7 @@ from wbc_baselines.learned.training.target_set import (
 )
 from wbc_bench.episodes import randomization
 from wbc_bench.episodes.protocol import EvalProtocol, Noise, find_protocol
-from wbc_bench.errors import ManifestError
+from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation
 from wbc_bench.outcomes import STRATA
@@ -455,6 +455,10 @@ def test_a_pool_knows_what_it_was_drawn_for(tmp_path):
         read_target_set(PROTOCOL, path)
     with pytest.raises(ManifestError, match="wbc-train targets"):
         read_target_set(PROTOCOL, tmp_path / "none.parquet")
+    with pytest.raises(ManifestError, match=r"`wbc-train targets --protocol 'my own\.toml' --path \S+`"):
+        read_target_set(PROTOCOL, tmp_path / "none.parquet", "my own.toml")
+    with pytest.raises(ProtocolError, match="valid for training: workspace"):  # no command could make it
+        read_target_set(find_protocol("reach_v1")[0])
     assert TARGET_SETS.exists() and len(STRATA) == 3
 
 

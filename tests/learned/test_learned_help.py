@@ -2,7 +2,8 @@
 
 import pytest
 
-from option_help import COUNT, UNIT, check_option, check_shown, commands, options
+from option_help import COUNT, UNIT, check_option, check_parses, check_shown, commands, options
+from printed_commands import printed_commands
 
 pytest.importorskip("torch")
 pytest.importorskip("rsl_rl")
@@ -29,3 +30,18 @@ def test_a_number_without_a_unit_is_noticed():
         "Learning rate of the policy."
     )
     assert UNIT.search("Duration [control steps].") and COUNT.search("Number of environments.")
+
+
+PRINTED = list(printed_commands("wbc-train"))
+
+
+@pytest.mark.parametrize(("place", "words"), PRINTED, ids=[" ".join(words) for _, words in PRINTED])
+def test_every_command_that_a_message_prints_can_be_given(place, words, capsys):
+    check_parses(words, cli.Command, cli.main, capsys)
+
+
+def test_version(capsys):
+    from importlib.metadata import version
+
+    cli.main(["--version"])
+    assert capsys.readouterr().out == f"wbc-train {version('wbc-bench')}\n"

@@ -56,7 +56,7 @@ class DemoTrain:
     def run(self) -> None:
         import time
 
-        from wbc_bench.errors import SourceError
+        from wbc_bench.errors import SourceError, missing_extra
         from wbc_bench.files import ensure_writable
         from wbc_bench.progress import Progress
 
@@ -64,9 +64,7 @@ class DemoTrain:
             from wbc_bench.sources.diffusion.policy import save_policy
             from wbc_bench.sources.diffusion.training import train
         except ImportError as error:
-            raise SourceError(
-                "training needs torch and safetensors: pip install 'wbc-bench[diffusion]'"
-            ) from error
+            raise SourceError(missing_extra("training", "diffusion", error)) from error
 
         at_least_one("--updates", self.updates)
         not_negative("--seed", self.seed)

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -140,4 +141,5 @@ class Eval(_Evaluation):
         evaluated = collect(store.runs(study.protocol))
         print_table(paper_table(study, evaluated))
         print_table(outcome_table(study, evaluated))
-        print(f"records are under {self.out}; `wbc-bench report` makes tables and figures of them")
+        command = f"wbc-bench report --results {quote(str(self.out))}"
+        print(f"records are under {self.out}; `{command}` makes tables and figures of them")

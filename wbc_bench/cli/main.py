@@ -58,7 +58,7 @@ Command = (
 
 DESCRIPTION = """Whole-body controllers on identical episodes.
 
-`wbc-bench --version` prints the version; `wbc-bench --tyro-print-completion {bash,zsh,tcsh}` prints a
+`wbc-bench --version` prints the version; `wbc-bench --tyro-print-completion bash` (or zsh, or tcsh) prints a
 script that completes commands and options in a shell."""
 
 

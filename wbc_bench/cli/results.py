@@ -8,6 +8,7 @@ import tyro
 from tyro.conf import Positional
 
 from wbc_bench.cli.common import RESULTS, UsageError, open_records, print_table
+from wbc_bench.errors import UnknownNameError
 
 
 @dataclass(frozen=True)
@@ -19,23 +20,31 @@ class Compare:
     b: Positional[str]
     """Second controller, which the first one is compared with."""
     protocol: str = "ablation_v1"
-    """Name of the protocol of the runs."""
+    """Name of the protocol of the runs, or path of its .toml file."""
     results: Path = RESULTS
     """Folder to read the records from."""
     out: Path | None = None
     """Folder to write the table to; it is only printed when not given."""
 
     def run(self) -> None:
+        from wbc_bench.episodes.protocol import load_protocol
         from wbc_bench.files import ensure_writable
         from wbc_bench.results.analysis import collect
         from wbc_bench.results.tables.pairs import compare_table
         from wbc_bench.results.tables.write import write_compare_table
 
-        evaluated = collect(open_records(self.results).runs(self.protocol))
-        print_table(compare_table(self.protocol, evaluated, self.a, self.b))
+        name = load_protocol(self.protocol).name if self.protocol.endswith(".toml") else self.protocol
+        store = open_records(self.results)
+        runs = store.runs(name)
+        if not runs:
+            known = {run.record.protocol for run in store.runs()}
+            where = f"--protocol, runs under {self.results}"
+            raise UnknownNameError("evaluated protocol", name, known, where)
+        evaluated = collect(runs)
+        print_table(compare_table(name, evaluated, self.a, self.b))
         if self.out:
             ensure_writable(self.out)
-            write_compare_table(self.protocol, evaluated, self.a, self.b, self.out)
+            write_compare_table(name, evaluated, self.a, self.b, self.out)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import hashlib
 from dataclasses import fields
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from wbc_bench.episodes.manifest_values import mistakes
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol
 from wbc_bench.episodes.rows import EpisodeManifest, neutral
 from wbc_bench.errors import ManifestError
+from wbc_bench.files import PROTOCOLS
 from wbc_bench.readers import check_columns, decode_parquet, read_bytes, read_digest
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
@@ -75,9 +77,7 @@ def read_manifest(
             columns, types, counts or values are not those of the protocol.
     """
     if not path.exists():
-        raise ManifestError(
-            f"manifest '{path}' does not exist: make it with `wbc-bench protocol freeze {protocol.name}`"
-        )
+        raise ManifestError(f"manifest '{path}' does not exist: make it with `{_command('freeze', path)}`")
     data = read_bytes(path, "manifest", ManifestError)
     sha256 = hashlib.sha256(data).hexdigest()
     hash_file = path.with_suffix(".sha256")
@@ -93,9 +93,10 @@ def read_manifest(
     if made_for != protocol.digest:
         raise ManifestError(
             f"manifest '{path}' was made for protocol digest {made_for[:16] or 'none'}..., "
-            f"the protocol {protocol.name} has {protocol.digest[:16]}...: freeze it again"
+            f"the protocol {protocol.name} has {protocol.digest[:16]}...: make it again with "
+            f"`{_command('freeze', path)}`"
         )
-    check_robot(table, protocol, f"manifest '{path}'", "freeze it again")
+    check_robot(table, protocol, f"manifest '{path}'", f"make it again with `{_command('freeze', path)}`")
     found: dict[str, Any] = {**neutral(len(table))}
     present = [f.name for f in fields(EpisodeManifest) if f.name not in found or f.name in table.column_names]
     columns = {_column(name): _type(name) for name in present}
@@ -109,7 +110,7 @@ def read_manifest(
     manifest = EpisodeManifest(**columns_read)
     if check_values:
         for mistake in mistakes(protocol, manifest):
-            raise ManifestError(f"manifest '{path}': {mistake}; `wbc-bench protocol verify` tells all")
+            raise ManifestError(f"manifest '{path}': {mistake}; `{_command('verify', path)}` tells all")
     return manifest, sha256
 
 
@@ -137,6 +138,12 @@ def _array(table: pa.Table, field: str) -> np.ndarray:
     if field in _WIDTHS:
         return column.flatten().to_numpy(zero_copy_only=False).reshape(len(table), _WIDTHS[field])
     return column.to_numpy(zero_copy_only=False)
+
+
+def _command(action: str, path: Path) -> str:
+    """The command that freezes or verifies a manifest: one of a user's own is found by its file alone."""
+    released = path.resolve().parent == PROTOCOLS.resolve()
+    return f"wbc-bench protocol {action} {path.stem if released else quote(str(path.with_suffix('.toml')))}"
 
 
 def _column(field: str) -> str:

@@ -52,7 +52,7 @@ class Learned:
             for card in trained:
                 budget = f"{card.samples:,} control steps of training"
                 found.append((f"{method}@{card.seed}", f"Training seed {card.seed}, {budget}."))
-        return [*found, ("FILE.safetensors", "A checkpoint of your own, see `wbc-train`.")]
+        return [*found, ("FILE.safetensors", "A checkpoint of your own, see `wbc-train --help`.")]
 
 
 class Onnx:
@@ -68,7 +68,7 @@ class Onnx:
 
     def variants(self) -> list[tuple[str, str]]:
         """Return the form of a variant, with its description."""
-        return [("FILE.onnx", "A learned controller that `wbc-bench export` wrote.")]
+        return [("FILE.onnx", "A learned controller that the command `export` wrote.")]
 
 
 make = Learned()

@@ -41,7 +41,7 @@ class OnnxEngine:
             self._session = onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
             text = self._session.get_modelmeta().custom_metadata_map.get(CARD)
         if text is None:
-            raise CheckpointError(f"'{path}' carries no card: write it by `wbc-bench export`")
+            raise CheckpointError(f"'{path}' carries no card, valid: a file that `export` of wbc-bench wrote")
         self.card, self.sha256 = decode_card(text.encode(), str(path)), hashlib.sha256(data).hexdigest()
         self.flow = flow_of(make_estimator(METHODS[self.card.method].estimator))
         self._check_flow(path)

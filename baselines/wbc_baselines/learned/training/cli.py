@@ -2,7 +2,9 @@
 
 import sys
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import tyro
@@ -115,7 +117,8 @@ class Curves:
 
         paths = write_curves(self.out, self.figures)
         if not paths:
-            raise TrainingError(f"--out {self.out}: no run has metrics there, make one with `wbc-train run`")
+            command = f"wbc-train run --method {DEFAULTS.method} --out {quote(str(self.out))}"
+            raise TrainingError(f"--out {self.out}: no run has metrics there, make one with `{command}`")
         for path in paths:
             print(path)
 
@@ -222,7 +225,7 @@ class Dagger:
             actor, error = dagger(
                 self.teacher,
                 protocol,
-                read_target_set(protocol),
+                read_target_set(protocol, requested=self.protocol),
                 self.episodes,
                 self.rounds,
                 self.seed,
@@ -276,9 +279,19 @@ Command = (
 )
 
 
+DESCRIPTION = """Train the learned controllers.
+
+`wbc-train --version` prints the version."""
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point; ends as `run_command` says."""
-    command = tyro.cli(
-        Command, prog="wbc-train", description="Train the learned controllers.", args=arguments
-    )
-    run_command(command.run, "the same command resumes at the last checkpoint")
+    words = sys.argv[1:] if arguments is None else arguments
+    run_command(lambda: _run(words), "the same command resumes at the last checkpoint")
+
+
+def _run(words: list[str]) -> None:
+    if words == ["--version"]:
+        print(f"wbc-train {version('wbc-bench')}")
+        return
+    tyro.cli(Command, prog="wbc-train", description=DESCRIPTION, args=words).run()

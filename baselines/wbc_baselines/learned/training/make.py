@@ -61,6 +61,6 @@ def make_environment(config: TrainConfig, target_set: TargetSet | None = None) -
 
         backend = CpuBackend(protocol, config.num_envs, config.threads)
     if target_set is None:
-        target_set = read_target_set(find_protocol(config.protocol)[0])
+        target_set = read_target_set(find_protocol(config.protocol)[0], requested=config.protocol)
     reward = METHODS[config.method].reward
     return Environment(protocol, backend, target_set, reward, config.seed, config.disturbance_scale(0))

@@ -8,6 +8,7 @@ episodes pick from it.
 import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from shlex import quote
 from typing import Any, NamedTuple
 
 import msgspec
@@ -72,8 +73,7 @@ def draw_target_set(
     Raises:
         ProtocolError: The protocol has no workspace targets, or a stratum cannot be filled.
     """
-    if not isinstance(protocol.targets, WorkspaceTargets):
-        raise ProtocolError(f"protocol {protocol.name}: targets of type reach, valid for training: workspace")
+    _check_targets(protocol)
     seed = protocol.episodes.seed + SEED_OFFSET
     shifted = msgspec.structs.replace(
         protocol, episodes=msgspec.structs.replace(protocol.episodes, seed=seed)
@@ -116,33 +116,40 @@ def write_target_set(target_set: TargetSet, protocol: EvalProtocol, path: Path) 
     fresh.replace(path)
 
 
-def read_target_set(protocol: EvalProtocol, path: Path | None = None) -> TargetSet:
+def read_target_set(
+    protocol: EvalProtocol, path: Path | None = None, requested: str | None = None
+) -> TargetSet:
     """Read the target set of a protocol.
 
     Args:
         protocol: Protocol of the training.
         path: Parquet file; None for the set that ships with the package.
+        requested: What the user gave to select the protocol, which error messages repeat, e.g. the path of a
+            file; the protocol's name when not given.
 
     Returns:
         The targets.
 
     Raises:
+        ProtocolError: The protocol has no workspace targets.
         ManifestError: The file is missing, unreadable, or was generated for other targets, another robot or
             other limits.
     """
+    _check_targets(protocol)
+    command = f"wbc-train targets --protocol {quote(requested or protocol.name)}"
+    if path is not None:
+        command += f" --path {quote(str(path))}"
     path = path or TARGET_SETS / f"{protocol.name}.parquet"
     if not path.exists():
-        raise ManifestError(
-            f"target set '{path}' does not exist: make it with `wbc-train targets --protocol {protocol.name}`"
-        )
+        raise ManifestError(f"target set '{path}' does not exist: make it with `{command}`")
     table = read_parquet(path, "target set", ManifestError, COLUMNS)
     made_for = (table.schema.metadata or {}).get(b"digest", b"").decode(errors="replace")
     if made_for != digest(protocol):
         raise ManifestError(
             f"target set '{path}' was drawn for digest {made_for[:16] or 'none'}..., protocol "
-            f"{protocol.name} has {digest(protocol)[:16]}...: draw it again with `wbc-train targets`"
+            f"{protocol.name} has {digest(protocol)[:16]}...: draw it again with `{command}`"
         )
-    check_robot(table, protocol, f"target set '{path}'", "draw it again with `wbc-train targets`")
+    check_robot(table, protocol, f"target set '{path}'", f"draw it again with `{command}`")
 
     def matrix(name: str) -> NDArray[np.float32]:
         column = table[name].combine_chunks()
@@ -150,7 +157,7 @@ def read_target_set(protocol: EvalProtocol, path: Path | None = None) -> TargetS
 
     found = TargetSet(table["stratum"].to_numpy(), *map(matrix, _WIDTHS))
     for problem in _mistakes(found):
-        raise ManifestError(f"target set '{path}': {problem}: draw it again with `wbc-train targets`")
+        raise ManifestError(f"target set '{path}': {problem}: draw it again with `{command}`")
     return found
 
 
@@ -169,3 +176,8 @@ def _mistakes(found: TargetSet) -> Iterator[str]:
     for quat in (found.quat_w, found.witness_qpos[:, 3:7]):
         if not (np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-5).all():  # of float32
             yield "the norm of a quaternion is not 1"
+
+
+def _check_targets(protocol: EvalProtocol) -> None:
+    if not isinstance(protocol.targets, WorkspaceTargets):
+        raise ProtocolError(f"protocol {protocol.name}: targets of type reach, valid for training: workspace")
