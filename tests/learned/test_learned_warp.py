@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-warp = pytest.importorskip("warp")
+wp = pytest.importorskip("warp")
 pytest.importorskip("mujoco_warp")
 
 from wbc_baselines.learned.training.backends.base import ResetState
@@ -25,7 +25,7 @@ def test_the_back_ends_agree_over_a_third_of_a_second(monkeypatch):
     start = samples.reset._replace(leg_q=0.2 * samples.reset.leg_q)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     if device == "cpu":  # optimizing the kernels would take minutes, and running them takes seconds
-        monkeypatch.setattr(warp.config, "optimization_level", 0)
+        monkeypatch.setattr(wp.config, "optimization_level", 0)
     cpu, warp = CpuBackend(PROTOCOL, 2, 1), WarpBackend(PROTOCOL, 2, device)
     first = [
         b.reset(torch.arange(2, device=b.device), ResetState(*(column.to(b.device) for column in start)))
