@@ -1,6 +1,7 @@
 """Imports point down only: every import statement of the two packages is read, the lazy ones too."""
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
@@ -129,6 +130,17 @@ def test_every_module_is_short_and_says_what_it_is_for():
         text = path.read_text(encoding="utf-8")
         assert len(text.splitlines()) <= 400, module
         assert path.name == "__init__.py" or ast.get_docstring(ast.parse(text)), module
+
+
+def test_docstrings_hold_no_markup():
+    """A bare `<name>` is a tag of HTML where the reference is rendered, and is not shown."""
+    for module, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                lines = (ast.get_docstring(node) or "").splitlines()
+                text = "\n".join(line for line in lines if not line.startswith("    "))  # code otherwise
+                tags = re.findall(r"</?[a-z_]+ ?/?>", re.sub(r"`[^`]*`", "", text))
+                assert not tags, f"{module}, {getattr(node, 'name', 'module')}: {tags}"
 
 
 def test_the_command_line_starts_light():

@@ -29,7 +29,7 @@ from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 def publish(
     store: ResultStore, out: Path, beside: Sequence[str] = (), studies: Sequence[Study] = ()
 ) -> list[Path]:
-    """Write <out>/tables, <out>/figures and <out>/report.html; equal records give equal bytes.
+    """Write `<out>/tables`, `<out>/figures` and `<out>/report.html`; equal records give equal bytes.
 
     They are made in a folder of their own and moved when all of them are there.
 

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import binomtest
 
 from wbc_bench.results import stats
+from wbc_bench.results.formatting import interval_text, p_value_text
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -99,6 +100,16 @@ def test_paired_bootstrap_without_a_difference():
     values = rng(6).normal(size=30)
     estimate, p = stats.paired_bootstrap(values, values, rng())
     assert estimate[:3] == (0.0, 0.0, 0.0) and p == 1.0
+
+
+def test_one_episode_has_no_interval():
+    """Every resample of it is itself: a width of 0 and a small p-value would claim certainty."""
+    estimate, p = stats.paired_bootstrap([3.0], [1.0], rng())
+    one = (stats.bootstrap_mean([3.0], rng()), stats.bootstrap_quantile([3.0], 0.95, rng()), estimate)
+    assert [each.point for each in one] == [3.0, 3.0, 2.0] and np.isnan(p)
+    assert np.isnan([each[1:3] for each in one]).all()
+    assert interval_text(estimate, 100.0, 1, "+") == "+200.0 [–, –]" and p_value_text(p) == "–"
+    assert stats.mcnemar_exact([1], [0]).p_value == 1.0
 
 
 def test_paired_bootstrap_p_value_agrees_with_its_interval():

@@ -1,6 +1,6 @@
 """What pushing doors shut leaves behind: a row per episode, a record of the run, and the table of them.
 
-<root>/doors/<source>/<controller>/<condition>_<seed>/run.json, episodes.parquet
+`<root>/doors/<source>/<controller>/<condition>_<seed>/run.json`, episodes.parquet
 """
 
 from collections.abc import Iterator, Mapping

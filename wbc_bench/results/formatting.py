@@ -21,7 +21,8 @@ def spread_text(value: stats.Spread, digits: int) -> str:
 def interval_text(value: stats.Estimate, scale: float, digits: int, sign: str = "") -> str:
     if np.isnan(value.point):
         return NONE
-    point, low, high = (f"{x * scale:{sign}.{digits}f}" for x in (value.point, value.low, value.high))
+    known = (value.point, value.low, value.high)
+    point, low, high = (NONE if np.isnan(x) else f"{x * scale:{sign}.{digits}f}" for x in known)
     return f"{point} [{low}, {high}]".replace("-", "−")
 
 

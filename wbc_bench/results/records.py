@@ -42,7 +42,7 @@ def parquet_of(table: pa.Table) -> tuple[bytes, str]:
 
 
 def driven_folder(root: Path, kind: str, record: Driven) -> Path:
-    """<root>/<kind>/<source>/<controller>/<condition>_<seed>"""
+    """`<root>/<kind>/<source>/<controller>/<condition>_<seed>`"""
     name = f"{record.condition}_{record.seed}"
     return root / kind / folder_name(record.source) / folder_name(record.controller) / name
 

@@ -83,7 +83,7 @@ REACH_CAPTION = (
 
 
 def figure_html(path: Path, caption: str) -> str:
-    """An image as an <img> with its bytes inside; separate images, so that ids of two SVGs cannot meet."""
+    """An image as an `<img>` with its bytes inside; separate images, so that ids of two SVGs cannot meet."""
     kind = {".svg": "svg+xml", ".png": "png"}[path.suffix]
     data = base64.b64encode(read_bytes(path, "figure", StoreError)).decode("ascii")
     return (
@@ -93,7 +93,7 @@ def figure_html(path: Path, caption: str) -> str:
 
 
 def given_caption(figure: Path) -> str:
-    """What stands in <name>.txt, or as `caption` in <name>.json, beside a figure; "" without either.
+    """What stands in `<name>.txt`, or as `caption` in `<name>.json`, beside a figure; "" without either.
 
     Raises: StoreError, a sidecar that cannot be read.
     """
@@ -157,7 +157,7 @@ def write(
     beside: Path | str | None = None,
     studies: Mapping[str, str] | None = None,
 ) -> Path:
-    """Writes <results_dir>/report.html from its tables/*.md, its figures and the runs (`collect_all`).
+    """Writes `<results_dir>/report.html` from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
     will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol.

@@ -68,14 +68,20 @@ def spread(values: ArrayLike) -> Spread:
 
 
 def bootstrap_mean(values: ArrayLike, rng: np.random.Generator, num_seeds: int = 1) -> Estimate:
-    """Mean over episodes with its percentile bootstrap interval, 95 %. Raises: ValueError if empty."""
+    """Mean over episodes with its percentile bootstrap interval, 95 %; NaN for the ends with one episode.
+
+    Raises: ValueError if empty.
+    """
     x = _filled(values)
     draws = np.concatenate([sample.mean(axis=1) for sample in _resample(x, rng)])
     return _percentile(float(x.mean()), draws, num_seeds, len(x), "bootstrap 95 %")
 
 
 def bootstrap_quantile(values: ArrayLike, q: float, rng: np.random.Generator, num_seeds: int = 1) -> Estimate:
-    """Quantile over episodes with its percentile bootstrap interval, 95 %. Raises: ValueError if empty."""
+    """Quantile over episodes with its percentile bootstrap interval, 95 %; NaN for the ends with one episode.
+
+    Raises: ValueError if empty.
+    """
     x = _filled(values)
     draws = np.concatenate([np.quantile(sample, q, axis=1) for sample in _resample(x, rng)])
     return _percentile(float(np.quantile(x, q)), draws, num_seeds, len(x), "bootstrap 95 %")
@@ -87,7 +93,8 @@ def paired_bootstrap(
     """Mean of a - b over the same episodes, its percentile interval (95 %) and two-sided p-value.
 
     The p-value inverts the interval: the smallest level at which it excludes 0, and never below
-    2 / (resamples + 1), since as many resamples cannot show less.
+    2 / (resamples + 1), since as many resamples cannot show less. One episode says nothing of the spread:
+    interval and p-value are NaN.
     Raises: ValueError without a value or when the two differ in length.
     Source: Efron & Tibshirani 1993, ch. 13 and 15.
     """
@@ -97,7 +104,7 @@ def paired_bootstrap(
     difference = x - y
     draws = np.concatenate([sample.mean(axis=1) for sample in _resample(difference, rng)])
     tail = min(int((draws <= 0.0).sum()), int((draws >= 0.0).sum()))
-    p_value = min(1.0, 2.0 * (tail + 1) / (len(draws) + 1))
+    p_value = min(1.0, 2.0 * (tail + 1) / (len(draws) + 1)) if len(x) > 1 else float("nan")
     estimate = _percentile(float(difference.mean()), draws, num_seeds, len(x), "paired bootstrap 95 %")
     return estimate, p_value
 
@@ -147,4 +154,6 @@ def _resample(x: FloatArray, rng: np.random.Generator):
 
 def _percentile(point: float, draws: FloatArray, num_seeds: int, episodes: int, method: str) -> Estimate:
     low, high = np.quantile(draws, [(1.0 - CONFIDENCE) / 2.0, (1.0 + CONFIDENCE) / 2.0])
+    if episodes == 1:  # every resample is that episode: a width of 0 would claim certainty
+        low = high = np.nan
     return Estimate(point, float(low), float(high), num_seeds, episodes, method)

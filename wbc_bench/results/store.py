@@ -172,7 +172,7 @@ class ResultStore:
         return pd.concat([run.episodes() for run in runs], ignore_index=True)
 
     def find(self, name: str) -> Run:
-        """A finished run by its folder, or by <protocol>/<controller>/replicate_<k> below this store.
+        """A finished run by its folder, or by `<protocol>/<controller>/replicate_<k>` below this store.
 
         Raises: UnknownNameError (with the nearest names), StoreError.
         """

@@ -1,6 +1,6 @@
 """A study: the controllers that share a table, the pairs that are tested, and what the paper prints of them.
 
-A study is a TOML file. The released ones are protocols/studies/<name>.toml; a file of a user's own has the
+A study is a TOML file. The released ones are `protocols/studies/<name>.toml`; a file of a user's own has the
 same form.
 """
 

@@ -84,7 +84,7 @@ class Table:
         return self.data.to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
     def html(self) -> str:
-        """A <table> that folds away under its title, cells escaped; `code` marks as in Markdown."""
+        """A `<table>` that folds away under its title, cells escaped; `code` marks as in Markdown."""
 
         def line(tag: str, cells: Sequence[str], kind: str = "") -> str:
             classes = (' class="number"' if number else "" for number in self.numeric)
@@ -106,7 +106,7 @@ class Table:
         return _Terminal(self)
 
     def write(self, out_dir: Path) -> list[Path]:
-        """Writes <out_dir>/<name>.md, .tex and .csv."""
+        """Writes `<out_dir>/<name>.md`, .tex and .csv."""
         out_dir.mkdir(parents=True, exist_ok=True)
         paths = []
         for suffix, text in (("md", self.markdown()), ("tex", self.latex()), ("csv", self.csv())):

@@ -1,6 +1,6 @@
 """What a tracked source leaves behind: time series, their scores, records on disk, and the table of them.
 
-<root>/tracks/<source>/<controller>/<condition>_<seed>/track.json, series.parquet
+`<root>/tracks/<source>/<controller>/<condition>_<seed>/track.json`, series.parquet
 """
 
 from collections.abc import Iterator, Mapping

@@ -1,6 +1,6 @@
 """Every constant of the IK controller.
 
-Tuned on the `tuning_*` protocols, which no table uses; the tuning and its budget are in baselines/README.md.
+Tuned on the `tuning_*` protocols, which no table uses; the tuning and its budget are in docs/training-log.md.
 """
 
 from dataclasses import dataclass, field

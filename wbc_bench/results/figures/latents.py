@@ -103,7 +103,7 @@ def latent_figure(name: str, samples: Samples, found: Separation, seed: int) -> 
 def write_latents(
     spec: str, protocol: str, samples: Samples, seed: int, out_dir: Path
 ) -> tuple[Separation, list[Path]]:
-    """Writes latent_<controller>.png, .svg and .json (numbers and caption) into a folder.
+    """Writes `latent_<controller>.png`, .svg and .json (numbers and caption) into a folder.
 
     Raises: LatentError.
     """

@@ -46,7 +46,7 @@ def controller_colours(names: Mapping[str, str]) -> dict[str, str]:
 
 
 def save(figure: Figure, name: str, out_dir: Path | str) -> list[Path]:
-    """Writes <out_dir>/<name>.png and .svg without dates or program versions in them."""
+    """Writes `<out_dir>/<name>.png` and .svg without dates or program versions in them."""
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     png, svg = folder / f"{name}.png", folder / f"{name}.svg"

@@ -36,7 +36,7 @@ def target_scatter(ax: Axes, frame: pd.DataFrame, stratum: str, view: str) -> Ax
 
 
 def write_targets(frame: pd.DataFrame, name: str, out_dir: Path | str) -> list[Path]:
-    """Side and top view of a manifest's targets, a column per stratum, as <name>_targets.
+    """Side and top view of a manifest's targets, a column per stratum, as `<name>_targets`.
 
     Args: frame with target_x, target_y, height [m] and stratum; world frame, base starts over the origin.
     """

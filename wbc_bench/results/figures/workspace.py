@@ -108,7 +108,7 @@ def chosen(methods: Sequence[tuple[str, Evaluated]], specs: Sequence[str]) -> li
 def write_workspace(
     study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str, specs: Sequence[str] = ()
 ) -> list[Path]:
-    """Targets, and beside them success of some controllers (default: the best two), as <study>_workspace.
+    """Targets, and beside them success of some controllers (default: the best two), as `<study>_workspace`.
 
     Raises: UnknownNameError, a controller named has no run.
     """

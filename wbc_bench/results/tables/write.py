@@ -17,7 +17,7 @@ def _write(tables: Sequence[Table], out_dir: Path | str) -> list[Path]:
 
 
 def write_study_tables(study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
-    """The study's five tables (four without a pair to compare), into `out_dir` itself (<results>/tables)."""
+    """The five tables of a study (four without a pair to compare), into `out_dir`: `<results>/tables`."""
     tables = [paper_table(study, evaluated), paper_table(study, evaluated, terminated=True)]
     tables += [outcome_table(study, evaluated), stratum_table(study, evaluated), pair_table(study, evaluated)]
     return _write(tables, out_dir)

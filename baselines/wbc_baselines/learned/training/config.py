@@ -89,7 +89,7 @@ class TrainConfig:
     returns of the initial policy; 0 for none."""
     std_legs: tuple[float, float] = (0.27, 0.05)
     """Initial and final standard deviation of the leg actions [1], in units of the action scale. At 0.14 a
-    policy keeps standing still and falls when pushed; at 0.27 it learns to step (see baselines/README.md)."""
+    policy keeps standing still and falls when pushed; at 0.27 it learns to step, see docs/training-log.md."""
     std_arm: tuple[float, float] = (0.4, 0.05)
     """Initial and final standard deviation of the arm actions [1], in units of the action scale."""
     std_steps: tuple[float, float] = (36e6, 58e6)
