@@ -52,9 +52,12 @@ LONGEST_TEXT = 500  # characters of somebody else's message
 
 _PACKAGES = {  # distribution of a module that has another name
     "imageio_ffmpeg": "imageio-ffmpeg",
+    "mujoco_warp": "mujoco-warp",
     "pink": "pin-pink",
     "pinocchio": "pin",
+    "rsl_rl": "rsl-rl-lib",
     "sklearn": "scikit-learn",
+    "warp": "warp-lang",
     "zmq": "pyzmq",
 }
 

@@ -21,7 +21,7 @@ from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
 from wbc_bench.results.store import ResultStore
-from wbc_bench.results.study import Study, StudyError, labels_of, released_studies, studies_of
+from wbc_bench.results.study import Study, StudyError, labels_of, released_rows, released_studies, studies_of
 from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 
@@ -45,7 +45,8 @@ def publish(
         UnknownNameError: A controller named has no run under any protocol.
     """
     known_studies = list({study.name: study for study in (*released_studies(), *studies)}.values())
-    labels = labels_of(row for study in known_studies for row in study.rows)
+    rows = [row for study in known_studies for row in study.rows]
+    labels = labels_of(rows)
     evaluated = collect_all(store.runs(), labels)
     for study in known_studies:
         if study.name != study.protocol and study.name in evaluated:
@@ -60,7 +61,7 @@ def publish(
         if spec not in known:
             raise UnknownNameError("evaluated controller", spec, known, "--workspace")
     specs = known | {track.record.controller for track in tracks}
-    colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)})
+    colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
@@ -83,7 +84,7 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a track cannot be read or the folder cannot be written.
     """
     with _writing(out):
-        return _write_tracks(read_tracks(root), out, _released_labels())
+        return _write_tracks(read_tracks(root), out, labels_of(released_rows()))
 
 
 def publish_doors(root: Path, out: Path) -> list[Path]:
@@ -92,7 +93,7 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a run cannot be read or the folder cannot be written.
     """
     with _writing(out):
-        return _write_doors(read_doors(root), out, _released_labels())
+        return _write_doors(read_doors(root), out, labels_of(released_rows()))
 
 
 @contextmanager
@@ -129,10 +130,6 @@ def _write_protocol(
     if released:
         manifest, _ = read_manifest(released, manifest_path(PROTOCOLS / f"{name}.toml"))
         write_targets(target_frame(manifest), name, out / "figures")
-
-
-def _released_labels() -> dict[str, str]:
-    return labels_of(row for study in released_studies() for row in study.rows)
 
 
 def _write_tracks(

@@ -11,9 +11,9 @@ import sys
 class Hidden:
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] == sys.argv[1]:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Hidden())
-from wbc_bench.cli.main import main
+from {} import main
 main(sys.argv[2:])
 """
 
@@ -26,6 +26,7 @@ CASES = [
     ("pinocchio", "pin", "bench", ("bench", "ik")),
     ("viser", "viser", "view", ("live", "--controller", "hold")),
     ("torch", "torch", "diffusion", ("live", "--controller", "hold", "--source", "diffusion")),
+    ("torch", "torch", "diffusion", ("demo", "train", "none.zarr.zip", "-o", "policy.safetensors")),
     ("zmq", "pyzmq", "live", ("live", "--controller", "hold", "--source", "stream")),
     (
         "distributed",
@@ -33,6 +34,15 @@ CASES = [
         "cluster",
         ("eval", "--controller", "hold", "--protocol", "smoke_v1", "--engine", "dask"),
     ),
+]
+
+
+RUN = ("wbc-train", "run", "--method", "no_latent", "--num-envs", "16", "--estimator-mini-batches", "1")
+CASES += [
+    ("torch", "torch", "learned", RUN),
+    ("rsl_rl", "rsl-rl-lib", "learned", RUN),
+    ("mujoco_warp", "mujoco-warp", "warp", (*RUN, "--backend", "warp")),
+    ("warp", "warp-lang", "warp", (*RUN, "--backend", "warp")),
 ]
 
 
@@ -44,9 +54,11 @@ CASES = [
 def test_a_missing_extra_is_one_line(
     tmp_path, module: str, package: str, extra: str, command: tuple[str, ...]
 ):
-    done = subprocess.run(
-        [sys.executable, "-c", HIDE, module, *command], capture_output=True, text=True, cwd=tmp_path
-    )
+    program = "wbc_bench.cli.main"
+    if command[0] == "wbc-train":
+        program, command = "wbc_baselines.learned.training.cli", command[1:]
+    line = [sys.executable, "-c", HIDE.format(program), module, *command]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
     last = done.stderr.strip().splitlines()[-1]

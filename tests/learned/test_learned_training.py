@@ -31,7 +31,7 @@ from wbc_baselines.learned.training.backends.cpu import CpuBackend
 from wbc_baselines.learned.training.campaign import campaign, is_done, runs_of, standing
 from wbc_baselines.learned.training.cli import main
 from wbc_baselines.learned.training.config import TrainingError
-from wbc_baselines.learned.training.curves import measured_scores, smooth, write_curves
+from wbc_baselines.learned.training.curves import curves_figure, measured_scores, smooth, write_curves
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment
 from wbc_baselines.learned.training.make import make_environment
 from wbc_baselines.learned.training.resets import sample_episodes
@@ -45,6 +45,8 @@ from wbc_bench.evaluation import simulation
 from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.randomness import stream
 from wbc_bench.registry import load_controller
+from wbc_bench.results.figures.style import GREEN, SKY
+from wbc_bench.results.study import labels_of, released_rows
 from wbc_bench.robot import load_robot
 
 
@@ -527,6 +529,35 @@ def test_smoothing_weighs_by_episodes():
     np.testing.assert_allclose(values, [0, 0.75, 0.75])
 
 
+def test_rewards_of_different_scales_have_axes_of_their_own():
+    """And a policy has the name and the colour that it has in the figures of the study."""
+
+    def run(name: str, best: float) -> tuple[str, list[dict]]:
+        values = {"episode/success": 0.5, "episode/falls": 0.1, "episode/pos_error": 0.02, "episode/count": 4}
+        return name, [{"samples": s, "episode/return": best * s, **values} for s in (1, 2)]
+
+    runs = [
+        run("transformer_gru@0", 1.0),
+        run("transformer_gru@1", 1.1),
+        run("transformer_gru_additive@0", 9.0),
+    ]
+    drawn = [ax for ax in curves_figure(runs).axes if ax.get_lines()]
+    gated, additive, *others = drawn
+    assert "gated" in gated.get_ylabel() and "additive" in additive.get_ylabel()
+    assert [len(ax.get_lines()) for ax in drawn] == [2, 1, 3, 3, 3]
+    assert max(gated.get_lines()[0].get_ydata()) == 2.0 and max(additive.get_lines()[0].get_ydata()) == 18.0
+    for ax in others:
+        assert [line.get_color() for line in ax.get_lines()] == [SKY, SKY, GREEN]
+    (one, *rest) = curves_figure(runs[:2]).axes
+    assert len(rest) == 3 and "gated" in one.get_ylabel()
+
+
+def test_methods_are_called_what_the_study_calls_them():
+    labels = labels_of(released_rows())
+    for name, method in METHODS.items():
+        assert labels[f"learned:{name}"] == method.label
+
+
 def test_the_scores_are_means_where_their_gate_is_open():
     """Of g = 0.25, (1 - g) s_m = 0.9 and g s_l = 0.3 on average: 1.2 and 1.2."""
     early = {"gate/phase": 1.0, "gate/manipulation": 0.0, "gate/reference": 9.0}
@@ -543,6 +574,7 @@ def test_the_scores_are_means_where_their_gate_is_open():
         ({"num_envs": 0}, "--num-envs 0"),
         ({"num_mini_batches": 49}, "1 to 48"),
         ({"estimator_mini_batches": 5}, "1 to 4"),
+        ({"estimator_share": 0.125}, r"share 0\.125\): give --estimator-mini-batches 1"),
     ],
 )
 def test_impossible_settings_are_refused(changes, words):

@@ -9,9 +9,9 @@ from synthetic import FakeStore, methods_in, reach_store, study_store
 from wbc_bench.results import analysis
 from wbc_bench.results.figures.reach import write_reach_figures
 from wbc_bench.results.figures.study import error_cdf, outcome_bars, success_by_stratum, write_study_figures
-from wbc_bench.results.figures.style import controller_colours
+from wbc_bench.results.figures.style import BLACK, BLUE, controller_colours
 from wbc_bench.results.figures.targets import write_targets
-from wbc_bench.results.study import find_study, methods_of
+from wbc_bench.results.study import Row, find_study, methods_of, released_rows
 
 ABLATION = find_study("ablation_v1")
 REACH = find_study("reach_v1")
@@ -68,6 +68,22 @@ def test_a_cdf_ends_at_the_share_that_stood():
     ax = error_cdf(Figure().subplots(), methods(), "position_error")
     for line, (_, method) in zip(ax.get_lines(), methods(), strict=False):
         assert np.asarray(line.get_ydata())[-1] == pytest.approx(100.0 * method.not_terminated.mean())
+
+
+def test_a_study_may_say_the_colour_of_a_name():
+    rows = [Row("", "Mine", "mine", colour="blue"), Row("", "Old", "old")]
+    colours = controller_colours({"mine": "Mine", "mine@0": "Mine", "b": "Other", "old": "Old"}, rows)
+    assert colours["mine"] == colours["mine@0"] == BLUE
+    assert len({colours["mine"], colours["b"], colours["old"]}) == 3
+
+
+def test_released_studies_agree_on_the_colour_of_a_name():
+    found: dict[str, set[str]] = {}
+    for row in released_rows():
+        if row.colour:
+            found.setdefault(row.label, set()).add(row.colour)
+    assert found and all(len(colours) == 1 for colours in found.values())
+    assert controller_colours({"ik": "Whole-body IK"}) == {"ik": BLACK}  # also where nobody else is drawn
 
 
 def test_a_controller_keeps_its_colour_whoever_else_is_drawn():

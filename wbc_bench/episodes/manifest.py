@@ -77,7 +77,9 @@ def read_manifest(
             columns, types, counts or values are not those of the protocol.
     """
     if not path.exists():
-        raise ManifestError(f"manifest '{path}' does not exist: make it with `{_command('freeze', path)}`")
+        raise ManifestError(
+            f"manifest '{path}' does not exist: make it with `wbc-bench protocol freeze {_given(path)}`"
+        )
     data = read_bytes(path, "manifest", ManifestError)
     sha256 = hashlib.sha256(data).hexdigest()
     hash_file = path.with_suffix(".sha256")
@@ -94,9 +96,14 @@ def read_manifest(
         raise ManifestError(
             f"manifest '{path}' was made for protocol digest {made_for[:16] or 'none'}..., "
             f"the protocol {protocol.name} has {protocol.digest[:16]}...: make it again with "
-            f"`{_command('freeze', path)}`"
+            f"`wbc-bench protocol freeze {_given(path)}`"
         )
-    check_robot(table, protocol, f"manifest '{path}'", f"make it again with `{_command('freeze', path)}`")
+    check_robot(
+        table,
+        protocol,
+        f"manifest '{path}'",
+        f"make it again with `wbc-bench protocol freeze {_given(path)}`",
+    )
     found: dict[str, Any] = {**neutral(len(table))}
     present = [f.name for f in fields(EpisodeManifest) if f.name not in found or f.name in table.column_names]
     columns = {_column(name): _type(name) for name in present}
@@ -110,7 +117,9 @@ def read_manifest(
     manifest = EpisodeManifest(**columns_read)
     if check_values:
         for mistake in mistakes(protocol, manifest):
-            raise ManifestError(f"manifest '{path}': {mistake}; `{_command('verify', path)}` tells all")
+            raise ManifestError(
+                f"manifest '{path}': {mistake}; `wbc-bench protocol verify {_given(path)}` tells all"
+            )
     return manifest, sha256
 
 
@@ -140,10 +149,10 @@ def _array(table: pa.Table, field: str) -> np.ndarray:
     return column.to_numpy(zero_copy_only=False)
 
 
-def _command(action: str, path: Path) -> str:
-    """The command that freezes or verifies a manifest: one of a user's own is found by its file alone."""
+def _given(path: Path) -> str:
+    """How a command is given the protocol of a manifest: one of a user's own is found by its file alone."""
     released = path.resolve().parent == PROTOCOLS.resolve()
-    return f"wbc-bench protocol {action} {path.stem if released else quote(str(path.with_suffix('.toml')))}"
+    return path.stem if released else quote(str(path.with_suffix(".toml")))
 
 
 def _column(field: str) -> str:

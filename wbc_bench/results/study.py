@@ -20,6 +20,7 @@ FOLDER = PROTOCOLS / "studies"
 ColumnName = Literal[
     "success", "position_mean", "position_p95", "orientation_mean", "orientation_p95", "action_variation"
 ]
+ColourName = Literal["blue", "vermilion", "green", "pink", "orange", "sky", "black", "grey"]
 
 
 class StudyError(BenchError):
@@ -37,6 +38,7 @@ class Row(_Block, frozen=True):
     label: str  # the name in tables and figures
     spec: str  # of the controller
     absent: str = "no run"  # what a table says when the controller has no run
+    colour: ColourName | None = None  # of the label in every figure; one that is free when not given
 
 
 class Paper(_Block, frozen=True):
@@ -128,6 +130,11 @@ def methods_of(study: Study, evaluated: Mapping[str, Evaluated]) -> list[tuple[s
     """Evaluated controllers with their labels, once each, in the order of their last rows."""
     labels = labels_of(study_rows(study, evaluated))
     return [(label, evaluated[spec]) for spec, label in labels.items() if spec in evaluated]
+
+
+def released_rows() -> list[Row]:
+    """The rows of every released study, which say how a controller is called and drawn everywhere."""
+    return [row for study in released_studies() for row in study.rows]
 
 
 def labels_of(rows: Iterable[Row]) -> dict[str, str]:

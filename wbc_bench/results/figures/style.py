@@ -1,6 +1,6 @@
 """Colours and line styles of all figures, and how a figure is saved: equal figures give equal bytes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +8,17 @@ from matplotlib import style
 from matplotlib.figure import Figure
 
 from wbc_bench.outcomes import Outcome
+from wbc_bench.results.study import ColourName, Row, released_rows
 
 STYLE = Path(__file__).with_name("wbc.mplstyle")
 # Okabe-Ito, named.
 BLUE, VERMILION, GREEN, PINK = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK = "#E69F00", "#56B4E9", "#000000"
 GREY = "#767676"
+COLOURS: dict[ColourName, str] = {
+    **{"blue": BLUE, "vermilion": VERMILION, "green": GREEN, "pink": PINK},
+    **{"orange": ORANGE, "sky": SKY, "black": BLACK, "grey": GREY},
+}
 SHADE = "#EDEDED"
 OUTCOME_COLOURS = {
     Outcome.SUCCESS: GREEN,
@@ -35,14 +40,20 @@ CONDITION_LINES: dict[str, dict[str, Any]] = {
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # so that curves that coincide both show
 
 
-def controller_colours(names: Mapping[str, str]) -> dict[str, str]:
-    """Spec -> colour; controllers of one name share it, so that all figures of a report agree.
+def controller_colours(names: Mapping[str, str], rows: Iterable[Row] | None = None) -> dict[str, str]:
+    """Spec -> colour. A name has the colour that a study gives it; the others share what is left in turn.
 
     Args:
-        names: Spec -> name in the figures, of every controller of the report.
+        names: Spec -> name in the figures, of every controller of a report or a figure.
+        rows: Rows of the studies that give names a colour; those of the released ones when not given.
     """
-    order = {name: k for k, name in enumerate(sorted(set(names.values())))}
-    return {spec: METHOD_COLOURS[order[name] % len(METHOD_COLOURS)] for spec, name in names.items()}
+    rows = released_rows() if rows is None else rows
+    given = {row.label: COLOURS[row.colour] for row in rows if row.colour}
+    known = {name: given[name] for name in names.values() if name in given}
+    free = [colour for colour in METHOD_COLOURS if colour not in known.values()] or METHOD_COLOURS
+    others = sorted(set(names.values()) - known.keys())
+    known |= {name: free[k % len(free)] for k, name in enumerate(others)}
+    return {spec: known[name] for spec, name in names.items()}
 
 
 def save(figure: Figure, name: str, out_dir: Path | str) -> list[Path]:

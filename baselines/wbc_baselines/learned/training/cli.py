@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, subcommand
 
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_bench.cli.common import run_command
+from wbc_bench.errors import missing_extra
 
 RUNS = Path("runs")
 DEFAULTS = TrainConfig("transformer_gru")  # for commands that take their methods from --methods
@@ -294,4 +295,10 @@ def _run(words: list[str]) -> None:
     if words == ["--version"]:
         print(f"wbc-train {version('wbc-bench')}")
         return
-    tyro.cli(Command, prog="wbc-train", description=DESCRIPTION, args=words).run()
+    command = tyro.cli(Command, prog="wbc-train", description=DESCRIPTION, args=words)
+    try:
+        command.run()
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith(("wbc_bench", "wbc_baselines")):
+            raise
+        raise TrainingError(missing_extra("wbc-train", "learned", error)) from error

@@ -225,8 +225,9 @@ class TrainConfig:
             )
         if self.estimator_mini_batches > self.estimator_envs:
             raise TrainingError(
-                f"--estimator-mini-batches {self.estimator_mini_batches}: valid: 1 to {self.estimator_envs} "
-                "(num-envs x estimator-share)"
+                f"--estimator-mini-batches {self.estimator_mini_batches}: valid: 1 to {self.estimator_envs}, "
+                f"the environments that train the estimator (--num-envs {self.num_envs} x --estimator-share "
+                f"{self.estimator_share:g}): give --estimator-mini-batches {self.estimator_envs} or more"
             )
 
     @property

@@ -4,19 +4,18 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.policy.methods import METHODS, Reward
 from wbc_baselines.learned.training.config import TrainingError
 from wbc_baselines.learned.training.run_folder import run_folders
-from wbc_bench.results.figures.style import DASHES, METHOD_COLOURS, STYLE, save
+from wbc_bench.results.figures.style import DASHES, controller_colours, save, styled
 
 Rows = list[dict]
+Run = tuple[str, Rows]  # METHOD@SEED and its metrics
 SMOOTHING = 0.03  # width of the moving mean, as a fraction of the control steps
 PANELS = (  # metric, axis label, factor
-    ("episode/return", "Return per episode", 1.0),
     ("episode/success", "Success in training (%)", 100.0),
     ("episode/falls", "Falls in training (%)", 100.0),
     ("episode/pos_error", "Position error at 10 s (cm)", 100.0),
@@ -46,8 +45,8 @@ def smooth(rows: Rows, metric: str) -> tuple[np.ndarray, np.ndarray]:
     return x, (sums[high] - sums[low]) / (weights[high] - weights[low])
 
 
-def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, factor: float) -> Axes:
-    """Plot one metric over millions of control steps, with one color per method and one dash per seed.
+def curve(ax: Axes, runs: Sequence[Run], metric: str, label: str, factor: float) -> Axes:
+    """Plot one metric over millions of control steps: a method in its colour of all figures, a dash per seed.
 
     Args:
         ax: Axes to draw on.
@@ -59,21 +58,45 @@ def curve(ax: Axes, runs: Sequence[tuple[str, Rows]], metric: str, label: str, f
     Returns:
         The axes.
     """
-    methods = list(dict.fromkeys(name.split("@")[0] for name, _ in runs))
+    colours = controller_colours({name: METHODS[_method(name)].label for name, _ in runs})
+    labelled = set()
     for name, rows in runs:
         method, _, seed = name.partition("@")
         x, y = smooth(rows, metric)
-        first = all(not n.startswith(f"{method}@") for n, _ in runs[: [n for n, _ in runs].index(name)])
         ax.plot(
             x / 1e6,
             factor * y,
-            color=METHOD_COLOURS[methods.index(method) % len(METHOD_COLOURS)],
+            color=colours[name],
             linestyle=DASHES[int(seed or 0) % len(DASHES)],
-            label=METHODS[method].label if first else None,
+            label=None if method in labelled else METHODS[method].label,
         )
+        labelled.add(method)
     ax.set(xlabel="Control steps (million)", ylabel=label)
     ax.set_ylim(bottom=0, top=102 if label.endswith("(%)") else None)
     return ax
+
+
+def curves_figure(runs: Sequence[Run]) -> Figure:
+    """Plot return, success, falls and error of runs; returns of different rewards have axes of their own.
+
+    The rewards have different scales: the returns of a gated and of an additive one cannot be compared.
+    """
+    by_reward: dict[Reward, list[Run]] = {}
+    for run in runs:
+        by_reward.setdefault(METHODS[_method(run[0])].reward, []).append(run)
+    figure = Figure(figsize=(3.8 * (1 + len(by_reward)), 5.6))
+    axes = list(figure.subplots(2, 1 + len(by_reward)).flat)
+    for reward, own in sorted(by_reward.items(), reverse=True):  # gated first
+        curve(axes.pop(0), own, "episode/return", f"Return per episode, {reward} reward", 1.0)
+    drawn = [curve(axes.pop(0), runs, *panel) for panel in PANELS]
+    for ax in axes:
+        ax.set_axis_off()
+    figure.legend(*drawn[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def _method(run: str) -> str:
+    return run.partition("@")[0]
 
 
 def measured_scores(rows: Rows, part: float = 0.1) -> tuple[float, float, float]:
@@ -116,10 +139,5 @@ def write_curves(out: Path, figures: Path, name: str = "learning_curves") -> lis
     runs = [(folder.path.name, folder.read_metrics()) for folder in run_folders(out, "metrics.jsonl")]
     if not runs:
         return []
-    with style.context(["default", str(STYLE)]):
-        figure = Figure(figsize=(7.6, 5.6))
-        axes = figure.subplots(2, 2)
-        for ax, panel in zip(axes.flat, PANELS, strict=True):
-            curve(ax, runs, *panel)
-        figure.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-        return save(figure, name, figures)
+    with styled():
+        return save(curves_figure(runs), name, figures)

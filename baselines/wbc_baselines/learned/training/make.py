@@ -7,6 +7,7 @@ from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.environment import Environment
 from wbc_baselines.learned.training.target_set import TargetSet, read_target_set
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
+from wbc_bench.errors import missing_extra
 
 
 def training_protocol(config: TrainConfig) -> EvalProtocol:
@@ -53,7 +54,10 @@ def make_environment(config: TrainConfig, target_set: TargetSet | None = None) -
     """
     protocol = training_protocol(config)
     if config.backend == "warp":
-        from wbc_baselines.learned.training.backends.warp import WarpBackend
+        try:
+            from wbc_baselines.learned.training.backends.warp import WarpBackend
+        except ImportError as error:
+            raise TrainingError(missing_extra("--backend warp", "warp", error)) from error
 
         backend = WarpBackend(protocol, config.num_envs)
     else:
