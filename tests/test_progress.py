@@ -32,3 +32,10 @@ def test_all_at_once_is_one_line(capsys, clock):
         clock[0] = 2.0
         bar.update(4, 4)
     assert capsys.readouterr().err == "4/4 episodes, 2.0/s, 2.0 s\n"
+
+
+def test_who_knows_better_says_what_is_left(capsys, clock):
+    with Progress("episodes") as bar:
+        clock[0] = 2.0
+        bar.update(4, 40, "ik", "at least 90 s left")
+    assert capsys.readouterr().err.splitlines()[0] == "4/40 episodes, 2.0/s, at least 90 s left, ik"

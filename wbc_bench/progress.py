@@ -18,7 +18,7 @@ class Progress:
 
     def __enter__(self) -> "Progress":
         if self._bar:
-            self._task = self._bar.add_task("", total=None, rate="")
+            self._task = self._bar.add_task("", total=None, rate="", left="")
             self._bar.start()
         return self
 
@@ -30,19 +30,24 @@ class Progress:
         elif kind is None and self.done:
             self._line(f"{time.monotonic() - self._start:.1f} s")
 
-    def update(self, done: int, total: int, what: str = "") -> None:
-        """`done` of `total` units are done, the latest of `what`."""
+    def update(self, done: int, total: int, what: str = "", left: str | None = None) -> None:
+        """`done` of `total` units are done, the latest of `what`.
+
+        `left` says what is known of the time left; by the units per second so far when not given, which is
+        right only where all units take equally long.
+        """
         first = self.done == 0
         self.done, self.total = done, total
         now = time.monotonic()
-        if self._bar:
-            rate = f"{self._rate(now):.1f} {self.unit}/s"
-            self._bar.update(self._task, completed=done, total=total, description=what, rate=rate)
-        elif (first and 0 < done < total) or now - self._last >= LINE_PERIOD:
-            self._last = now
-            rate = self._rate(now)
+        rate = self._rate(now)
+        if left is None:
             # the first units also waited for processes to start: they say little of the others
             left = f"{(total - done) / rate:.0f} s left" if rate and not first else "time left unknown"
+        if self._bar:
+            shown = f"{rate:.1f} {self.unit}/s"
+            self._bar.update(self._task, completed=done, total=total, description=what, rate=shown, left=left)
+        elif (first and 0 < done < total) or now - self._last >= LINE_PERIOD:
+            self._last = now
             self._line(f"{left}{', ' if what else ''}{what}")
 
     def _rate(self, now: float) -> float:
@@ -55,7 +60,7 @@ class Progress:
 
 def _bar():
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
     from rich.progress import Progress as Bar
 
     return Bar(
@@ -63,6 +68,6 @@ def _bar():
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}"),
         console=Console(stderr=True),
     )

@@ -98,6 +98,9 @@ def test_same_samples_same_bytes(tmp_path, monkeypatch, kinds):
     assert [path.name for path in paths] == [f"latent_a-b.{suffix}" for suffix in ("png", "svg", "json")]
     for path in paths:
         assert path.read_bytes() == (tmp_path / "one" / path.name).read_bytes()
+    named, _ = write_latents("a:b", "p", synthetic(3.0, kinds=kinds), 0, tmp_path, "My policy")[1][:2]
+    text = named.with_suffix(".json").read_text()
+    assert "Latent of My policy on p" in text and json.loads(text)["controller"] == "a:b"
     facts = json.loads(paths[-1].read_text())
     assert facts["balanced_accuracy"] == pytest.approx(found.accuracy.point)
     assert f"chance is {100 * found.chance:.0f} %" in facts["caption"]

@@ -89,6 +89,7 @@ class Latent:
         from wbc_bench.registry import load_controller, spec_of_replicate
         from wbc_bench.results.figures.latents import summary, write_latents
         from wbc_bench.results.latents import LEAST_EPISODES
+        from wbc_bench.results.study import labels_of, released_rows
         from wbc_bench.robot import load_robot
 
         protocol, path = find_protocol(self.protocol)
@@ -103,5 +104,8 @@ class Latent:
         rows = manifest.of_replicate(0, self.episodes)
         samples = sample_latents(controller, protocol, rows)
         ensure_writable(self.out)
-        found, paths = write_latents(controller.info.name, protocol.name, samples, self.seed, self.out)
+        labels = labels_of(released_rows())
+        label = labels.get(spec) or labels.get(self.controller)
+        name = controller.info.name
+        found, paths = write_latents(name, protocol.name, samples, self.seed, self.out, label)
         print(*summary(samples, found), *paths, sep="\n")

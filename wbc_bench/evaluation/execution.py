@@ -16,6 +16,7 @@ from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.shard import SHARD_EPISODES
+from wbc_bench.evaluation.time_left import TimeLeft
 from wbc_bench.evaluation.workers import Engine, Result, Task, results
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.progress import Progress
@@ -68,14 +69,21 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, overwrite:
         for run in runs:
             run.report_reused()
             run.finish_if_whole(shared)  # killed between the last shard and the merge
-        missing = sum(len(run.writer.rows(shard)) for run in runs for shard in run.writer.missing)
-        if missing:
+        missing: dict[str, int] = {}  # controller -> episodes
+        for run in runs:
+            count = sum(len(run.writer.rows(shard)) for shard in run.writer.missing)
+            missing[run.job.spec] = missing.get(run.job.spec, 0) + count
+        total = sum(missing.values())
+        left = TimeLeft(missing, None if engine.address else engine.workers)
+        if total:
             with Progress("episodes") as progress:
                 for result in results(tasks, engine):
                     run = runs[result.run]
                     run.accept(result)
                     done = progress.done + len(result.episodes)
-                    progress.update(done, missing, f"{run.job.spec} replicate {run.replicate}")
+                    left.add(run.job.spec, len(result.episodes), result.started, result.cost.seconds)
+                    name = f"{run.job.spec} replicate {run.replicate}"
+                    progress.update(done, total, name, left.text())
                     run.finish_if_whole(shared)
         return [run.writer.finished for run in runs if run.writer.finished]
 

@@ -101,21 +101,23 @@ def latent_figure(name: str, samples: Samples, found: Separation, seed: int) -> 
 
 
 def write_latents(
-    spec: str, protocol: str, samples: Samples, seed: int, out_dir: Path
+    spec: str, protocol: str, samples: Samples, seed: int, out_dir: Path, label: str | None = None
 ) -> tuple[Separation, list[Path]]:
     """Writes `latent_<controller>.png`, .svg and .json (numbers and caption) into a folder.
+
+    `label` is the name of the controller in all figures of a report; its spec when not given.
 
     Raises: LatentError.
     """
     found = separate(samples, np.random.default_rng(seed))
     with styled():
-        figure = latent_figure(spec, samples, found, seed)
+        figure = latent_figure(label or spec, samples, found, seed)
         paths = save(figure, f"latent_{folder_name(spec)}", out_dir)
     accuracy = found.accuracy
     episodes = found.train_episodes + accuracy.num_episodes
     caption = (
-        f"Latent of {spec} on {protocol}, {episodes} episodes, coloured by the phase of the task: precision "
-        f"below {samples.precision_below * CM:g} cm of position error, locomotion from "
+        f"Latent of {label or spec} on {protocol}, {episodes} episodes, coloured by the phase of the task: "
+        f"precision below {samples.precision_below * CM:g} cm of position error, locomotion from "
         f"{LOCOMOTION_ABOVE * CM:.0f} cm, approach between. A linear discriminant names "
         f"{_percent(accuracy)} of the steps of held-out episodes right, phases weighing alike; "
         f"chance is {100 * found.chance:.0f} %."

@@ -87,7 +87,7 @@ def curves_figure(runs: Sequence[Run]) -> Figure:
     figure = Figure(figsize=(3.8 * (1 + len(by_reward)), 5.6))
     axes = list(figure.subplots(2, 1 + len(by_reward)).flat)
     for reward, own in sorted(by_reward.items(), reverse=True):  # gated first
-        curve(axes.pop(0), own, "episode/return", f"Return per episode, {reward} reward", 1.0)
+        curve(axes.pop(0), own, "episode/return", f"Return per episode ({reward})", 1.0)
     drawn = [curve(axes.pop(0), runs, *panel) for panel in PANELS]
     for ax in axes:
         ax.set_axis_off()
