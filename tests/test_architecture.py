@@ -21,7 +21,17 @@ LAYERS = (
     ("controller",),
     ("episodes",),
     ("robot", "results", "tensors"),
-    ("provenance", "progress", "outcomes", "files", "readers", "schema", "installed", "isolation"),
+    (
+        "provenance",
+        "progress",
+        "outcomes",
+        "files",
+        "readers",
+        "schema",
+        "installed",
+        "isolation",
+        "parallel",
+    ),
     ("rotations", "randomness", "errors"),
 )
 HEAVY = ("mujoco", "torch", "pinocchio", "placo")
@@ -123,6 +133,12 @@ def test_results_need_neither_physics_nor_learning():
     """Numbers are made of records alone: an analysis runs where neither is installed."""
     for module in (m for m in MODULES if m.startswith("wbc_bench.results")):
         assert not reaches(module) & set(HEAVY), module
+
+
+def test_processes_are_started_in_one_place():
+    """`wbc_bench.parallel` sees to it that none outlives its parent."""
+    found = [module for module in MODULES if any(name.split(".")[0] == "joblib" for name in imports(module))]
+    assert found == ["wbc_bench.parallel"]
 
 
 def test_every_module_is_short_and_says_what_it_is_for():

@@ -545,7 +545,8 @@ def test_rewards_of_different_scales_have_axes_of_their_own():
     gated, additive, *others = drawn
     assert "gated" in gated.get_ylabel() and "additive" in additive.get_ylabel()
     assert [len(ax.get_lines()) for ax in drawn] == [2, 1, 3, 3, 3]
-    assert max(gated.get_lines()[0].get_ydata()) == 2.0 and max(additive.get_lines()[0].get_ydata()) == 18.0
+    highest = [float(np.max(np.asarray(ax.get_lines()[0].get_ydata()))) for ax in (gated, additive)]
+    assert highest == [2.0, 18.0]
     for ax in others:
         assert [line.get_color() for line in ax.get_lines()] == [SKY, SKY, GREEN]
     (one, *rest) = curves_figure(runs[:2]).axes

@@ -15,11 +15,11 @@ from wbc_bench.episodes.targets import (
     Progress,
     TargetDraw,
     classify,
-    in_parallel,
     manifest_row,
     solver_of,
 )
 from wbc_bench.errors import ManifestError, ProtocolError
+from wbc_bench.parallel import in_parallel
 from wbc_bench.randomness import stream
 from wbc_bench.rotations import matrix_from_rpy, wxyz_from_matrix
 

@@ -11,11 +11,10 @@ and the termination limits all hold with the margins stated in `static_solver.py
 witness.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -73,8 +72,3 @@ def manifest_row(
         **draws._asdict(),
         **labels,
     }
-
-
-def in_parallel(workers: int, work: Callable, items: Iterable) -> Iterator:
-    """Results in the order of the items, as they come."""
-    return Parallel(n_jobs=workers, return_as="generator")(delayed(work)(item) for item in items)  # pyright: ignore

@@ -12,12 +12,12 @@ from wbc_bench.episodes.targets import (
     Progress,
     TargetDraw,
     classify,
-    in_parallel,
     manifest_row,
     solver_of,
 )
 from wbc_bench.errors import ProtocolError
 from wbc_bench.outcomes import STRATA
+from wbc_bench.parallel import in_parallel
 from wbc_bench.randomness import stream
 from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, wxyz_from_matrix
 

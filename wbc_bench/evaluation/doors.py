@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from wbc_bench import provenance
@@ -15,6 +14,7 @@ from wbc_bench.episodes.single import door_protocol, episode_of
 from wbc_bench.errors import SourceError
 from wbc_bench.evaluation.tracking import Moment, follow
 from wbc_bench.files import ensure_writable
+from wbc_bench.parallel import in_parallel
 from wbc_bench.registry import load_controller
 from wbc_bench.results.doors import write_doors
 from wbc_bench.results.tracking import STOOD
@@ -147,9 +147,11 @@ def _run_all(
     progress: Callable[[int, int], None],
 ) -> Iterator[DoorEpisode]:
     """Doors 0 to count - 1 in their order, a worker an episode at a time."""
-    jobs = (delayed(_run_one)(policy, spec, condition, seed, k) for k in range(count))
-    found: Any = Parallel(n_jobs=workers, return_as="generator")(jobs)
-    for done, episode in enumerate(found, 1):
+
+    def run_one(number: int) -> DoorEpisode:
+        return _run_one(policy, spec, condition, seed, number)
+
+    for done, episode in enumerate(in_parallel(workers, run_one, range(count)), 1):
         progress(done, count)
         yield episode
 

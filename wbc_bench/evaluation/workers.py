@@ -3,16 +3,12 @@
 Workers return rows; only the client writes.
 """
 
-import os
 import resource
-import signal
-import threading
 import time
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -22,6 +18,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import BenchError, ControllerError, UnknownNameError, fault_of, missing_extra
 from wbc_bench.evaluation.shard import evaluate_shard
+from wbc_bench.parallel import WorkerError, in_parallel
 from wbc_bench.results.store import ShardCost
 
 ENGINES = ("loky", "dask")
@@ -87,9 +84,8 @@ def _work(task: Task) -> Result:
     return Result(task.run, task.shard, episodes, started, ShardCost(time.time() - started, rss))
 
 
-def _work_for(client: int, task: Task) -> Result:
-    """One shard, on a worker that does not outlive its client."""
-    _leave_with(client)
+def _work_apart(task: Task) -> Result:
+    """One shard, on a worker of this machine."""
     try:
         return _work(task)
     except KeyboardInterrupt as error:  # interrupts are the client's: this one was raised by somebody's code
@@ -97,22 +93,6 @@ def _work_for(client: int, task: Task) -> Result:
             f"controller '{task.controller if isinstance(task.controller, str) else 'handed over'}' raised "
             f"{fault_of(error)}"
         ) from None
-
-
-@cache
-def _leave_with(client: int) -> None:
-    """End this process once its parent is gone: loky's workers outlive a killed one, holding their memory.
-
-    Until then its parent alone answers an interrupt, with one line instead of a traceback per worker.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        while os.getppid() == client:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def results(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
@@ -125,24 +105,15 @@ def results(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
 
 
 def _on_loky(tasks: Iterable[Task], workers: int) -> Iterator[Result]:
-    from joblib import Parallel, delayed, parallel_config
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
     pending = {(task.run, task.shard): task for task in tasks}
     deaths = 0
     while pending:
         try:
-            with parallel_config("loky", inner_max_num_threads=1):
-                # max_nbytes: rows are small, and a temporary folder of memory maps would outlive a kill
-                options: Any = {"batch_size": 1, "max_nbytes": None}
-                parallel = Parallel(workers, return_as="generator_unordered", **options)
-                client = os.getpid()
-                results: Any = parallel(delayed(_work_for)(client, task) for task in list(pending.values()))
-                for result in results:
-                    del pending[result.run, result.shard]
-                    deaths = 0
-                    yield result
-        except BrokenProcessPool as error:  # one dead worker takes the whole pool down
+            for result in in_parallel(workers, _work_apart, list(pending.values()), ordered=False):
+                del pending[result.run, result.shard]
+                deaths = 0
+                yield result
+        except WorkerError as error:
             deaths += 1
             if deaths == MAX_DEATHS:
                 raise ExecutionError(

@@ -8,11 +8,10 @@ online learning".
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import huber_loss
@@ -37,6 +36,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest, neutral
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.outcomes import STRATA
+from wbc_bench.parallel import in_parallel
 from wbc_bench.randomness import stream
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot, load_robot
@@ -165,14 +165,13 @@ def record(
         The dataset of all episodes.
     """
     state = student.state_dict() if student else None
-    common = spec, protocol, target_set, seed
-    jobs = (
-        delayed(_record_shard)(*common, k, min(SHARD, episodes - first), state, student_fraction)
-        for k, first in enumerate(range(0, episodes, SHARD))
-    )
+
+    def work(number: int) -> ImitationDataset:
+        count = min(SHARD, episodes - number * SHARD)
+        return _record_shard(spec, protocol, target_set, seed, number, count, state, student_fraction)
+
     parts: list[ImitationDataset] = []
-    found: Any = Parallel(n_jobs=workers, return_as="generator")(jobs)
-    for part in found:
+    for part in in_parallel(workers, work, range(-(-episodes // SHARD))):
         parts.append(part)
         progress(min(len(parts) * SHARD, episodes), episodes)
     return ImitationDataset.joined(parts)

@@ -9,13 +9,12 @@ import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from shlex import quote
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from wbc_baselines.learned.packaged import TARGET_SETS
@@ -24,6 +23,7 @@ from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
 from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
 from wbc_bench.outcomes import STRATA
+from wbc_bench.parallel import in_parallel
 from wbc_bench.readers import read_parquet
 from wbc_bench.robot import load_robot
 from wbc_bench.schema import meaning
@@ -84,10 +84,7 @@ def draw_target_set(
         return [(STRATA.index(d.stratum), d.pos_w, d.quat_w, d.feasible_qpos) for d in draws]
 
     rows: list[tuple] = []
-    parts: Any = Parallel(n_jobs=workers, return_as="generator")(
-        delayed(work)(start) for start in range(0, count, CHUNK)
-    )
-    for part in parts:
+    for part in in_parallel(workers, work, range(0, count, CHUNK)):
         rows.extend(part)
         progress(len(rows), count)
     stratum, *poses = zip(*rows, strict=True)
