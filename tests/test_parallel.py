@@ -49,9 +49,7 @@ def test_nothing_outlives_a_killed_process(tmp_path):
         process.kill()
         process.wait()
         wait_until(lambda: not group_exists(process.pid))
-        wait_until(
-            lambda: not [path for path in SHARED_MEMORY.glob(f"*{process.pid}*") if SHARED_MEMORY.exists()]
-        )
+        wait_until(lambda: not list(SHARED_MEMORY.glob(f"*[_-]{process.pid}[_-]*")))
     finally:
         if group_exists(process.pid):
             os.killpg(process.pid, signal.SIGKILL)

@@ -177,6 +177,31 @@ def test_dask_starts_its_own_cluster(tiny, reference, tmp_path):
     assert record_bytes(tmp_path) == expected
 
 
+def test_a_dask_cluster_has_no_web_server():
+    """What listens are scheduler, worker and nanny, for this machine alone; a dashboard would be more."""
+    distributed = pytest.importorskip("distributed")
+    import psutil
+
+    from wbc_bench.evaluation.dask_cluster import local_cluster
+
+    def listening() -> set[tuple[str, int]]:
+        own = psutil.Process()
+        found = [
+            c for process in (own, *own.children(recursive=True)) for c in process.net_connections("inet")
+        ]
+        return {tuple(c.laddr) for c in found if c.status == psutil.CONN_LISTEN}
+
+    before = listening()
+    with local_cluster(1) as cluster, distributed.Client(cluster) as client:
+        client.wait_for_workers(1, timeout=30)
+        info = client.scheduler_info()
+        (address, worker), *others = info["workers"].items()
+        assert worker["nthreads"] == 1 and not others
+        addresses = (info["address"], address, worker["nanny"])
+        known = {("127.0.0.1", int(address.rpartition(":")[2])) for address in addresses}
+        assert listening() - before == known and len(known) == 3
+
+
 def test_no_scheduler_at_the_address(tiny, tmp_path, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers_module, "CONNECT_TIMEOUT", 0.3)

@@ -124,14 +124,14 @@ def _on_loky(tasks: Iterable[Task], workers: int) -> Iterator[Result]:
 
 def _on_dask(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
     try:
-        from distributed import Client, KilledWorker, LocalCluster, as_completed
+        from distributed import Client, KilledWorker, as_completed
+
+        from wbc_bench.evaluation.dask_cluster import local_cluster
     except ImportError as error:
         raise ExecutionError(missing_extra("--engine dask", "cluster", error)) from error
     with ExitStack() as stack:
         if engine.address is None:
-            options: Any = {"dashboard_address": None}  # no web server
-            cluster = LocalCluster(n_workers=engine.workers, threads_per_worker=1, **options)
-            where: Any = stack.enter_context(cluster)
+            where: Any = stack.enter_context(local_cluster(engine.workers))
         else:
             where = engine.address
         try:

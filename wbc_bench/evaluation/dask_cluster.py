@@ -1,0 +1,32 @@
+"""A dask cluster of this machine without a web server.
+
+`LocalCluster(dashboard_address=None)` leaves out the pages of the dashboard and still opens its port, 8787,
+and one more per worker.
+"""
+
+import logging
+from typing import Any
+
+from distributed import Nanny, Scheduler, SpecCluster, Worker
+
+HOST = "127.0.0.1"
+
+
+class _QuietScheduler(Scheduler):
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
+
+
+class _QuietWorker(Worker):
+    def start_http_server(self, *_: Any, **__: Any) -> None:
+        """Open no port."""
+
+
+def local_cluster(workers: int) -> SpecCluster:
+    """A scheduler in this process, and workers in processes of their own, with one thread each."""
+    options = {"host": HOST, "nthreads": 1, "worker_class": _QuietWorker, "dashboard": False}
+    return SpecCluster(
+        workers={k: {"cls": Nanny, "options": options} for k in range(workers)},
+        scheduler={"cls": _QuietScheduler, "options": {"host": HOST, "port": 0, "dashboard": False}},
+        silence_logs=logging.WARNING,
+    )
