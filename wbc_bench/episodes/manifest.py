@@ -98,12 +98,8 @@ def read_manifest(
             f"the protocol {protocol.name} has {protocol.digest[:16]}...: make it again with "
             f"`wbc-bench protocol freeze {_given(path)}`"
         )
-    check_robot(
-        table,
-        protocol,
-        f"manifest '{path}'",
-        f"make it again with `wbc-bench protocol freeze {_given(path)}`",
-    )
+    remedy = f"make it again with `wbc-bench protocol freeze {_given(path)}`"
+    check_robot(table, protocol, f"manifest '{path}'", remedy)
     found: dict[str, Any] = {**neutral(len(table))}
     present = [f.name for f in fields(EpisodeManifest) if f.name not in found or f.name in table.column_names]
     columns = {_column(name): _type(name) for name in present}

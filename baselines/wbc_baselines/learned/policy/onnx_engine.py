@@ -90,7 +90,7 @@ def check_seal(data: bytes, path: Path) -> None:
     if end[:-digits] != seal(b"")[:-digits]:
         raise CheckpointError(
             f"'{path}' is not an ONNX file that can be run here: it carries no card and digest at its end, "
-            "so it was cut short or not written by this version of `wbc-bench export`"
+            "so it was cut short or not exported by this version of wbc-bench"
         )
     raise CheckpointError(
         f"'{path}' is altered: SHA-256 {hashlib.sha256(model).hexdigest()[:12]} of {len(model)} bytes, "
