@@ -184,7 +184,7 @@ def test_a_dask_cluster_has_no_web_server():
 
     from wbc_bench.evaluation.dask_cluster import local_cluster
 
-    def listening() -> set[tuple[str, int]]:
+    def listening() -> set[tuple[str | int, ...]]:
         own = psutil.Process()
         found = [
             c for process in (own, *own.children(recursive=True)) for c in process.net_connections("inet")

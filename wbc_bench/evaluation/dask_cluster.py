@@ -25,8 +25,9 @@ class _QuietWorker(Worker):
 def local_cluster(workers: int) -> SpecCluster:
     """A scheduler in this process, and workers in processes of their own, with one thread each."""
     options = {"host": HOST, "nthreads": 1, "worker_class": _QuietWorker, "dashboard": False}
+    quiet: Any = logging.WARNING  # a level, as `LocalCluster` hands it on
     return SpecCluster(
         workers={k: {"cls": Nanny, "options": options} for k in range(workers)},
         scheduler={"cls": _QuietScheduler, "options": {"host": HOST, "port": 0, "dashboard": False}},
-        silence_logs=logging.WARNING,
+        silence_logs=quiet,
     )
