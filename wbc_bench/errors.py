@@ -84,6 +84,8 @@ def fault_of(error: BaseException) -> str:
         f"{Path(frame.filename).name}:{frame.lineno} in {frame.name}"
         for frame in traceback.extract_tb(error.__traceback__)
         if not Path(frame.filename).is_relative_to(Path(__file__).parent)
+        and not frame.filename.startswith("<frozen ")
+        and "importlib" not in Path(frame.filename).parts
     ]
     try:
         text = " ".join(str(error).split())
