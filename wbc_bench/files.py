@@ -5,6 +5,8 @@ import errno
 import hashlib
 import os
 import re
+import shutil
+import time
 from pathlib import Path
 
 from wbc_bench.errors import StoreError
@@ -41,6 +43,10 @@ def is_folder_name(name: str) -> bool:
     return plain is not None and len(name) <= LONGEST_NAME
 
 
+STALE = 3600.0  # [s] what a temporary file is written in is a minute at most
+_TEMPORARY = re.compile(r"\.?\.probe-\d+(\.\d+\.tmp)?|\.publish-\w+")
+
+
 def write_atomic(path: Path, data: bytes) -> None:
     """Write a file that is afterwards either whole or not there, even after a power cut.
 
@@ -65,17 +71,31 @@ def write_atomic(path: Path, data: bytes) -> None:
 def ensure_writable(folder: Path) -> None:
     """Create a folder and write to it, before minutes are spent on what cannot be kept.
 
+    What a killed process left there of this package's temporary files is removed.
+
     Raises: StoreError when that fails; permission bits alone do not tell (root, read-only mounts).
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(f"folder '{folder}' cannot be written: {error.strerror}") from error
+    _sweep(folder)
     probe = folder / f".probe-{os.getpid()}"
     try:
         write_atomic(probe, b"probe")
     finally:
         probe.unlink(missing_ok=True)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove temporary files and folders of this package that nobody has touched for STALE seconds."""
+    with contextlib.suppress(OSError):  # whoever else sweeps, or a folder of somebody else's
+        for path in folder.iterdir():
+            if _TEMPORARY.fullmatch(path.name) and time.time() - path.lstat().st_mtime > STALE:
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path, ignore_errors=True)
+                else:
+                    path.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -415,3 +415,27 @@ def test_protocol_show(capsys, tiny, tmp_path):
     main(["protocol", "show", str(tiny), "--out", str(tmp_path / "pictures")])
     assert "digest" in capsys.readouterr().out
     assert list((tmp_path / "pictures").glob("tiny_targets.*"))
+
+
+@pytest.mark.parametrize("words", ["robot show", "film run --episode 0 --strip x.png"])
+def test_a_missing_library_to_draw_with_is_one_line(tmp_path, words):
+    """MuJoCo loads it when it is imported, and fails with a traceback of its own."""
+    command = [sys.executable, "-c", BROKEN_GL, *words.split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stdout == ""
+    assert (
+        done.stderr.startswith("error: MuJoCo cannot draw with MUJOCO_GL=") and done.stderr.count("\n") == 1
+    )
+
+
+BROKEN_GL = """
+import builtins, sys
+inner = builtins.__import__
+def no_mujoco(name, *args, **kwargs):
+    if name == "mujoco":
+        raise AttributeError("'NoneType' object has no attribute 'glGetError'")
+    return inner(name, *args, **kwargs)
+builtins.__import__ = no_mujoco
+from wbc_bench.cli.main import main
+main()
+"""

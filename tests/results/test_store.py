@@ -5,6 +5,7 @@ import hashlib
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import msgspec
@@ -16,7 +17,7 @@ import pytest
 
 from synthetic import FakeRun, episodes, record
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.files import ensure_writable, folder_name, write_atomic
+from wbc_bench.files import STALE, ensure_writable, folder_name, write_atomic
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
 from wbc_bench.results.analysis import collect
@@ -262,6 +263,26 @@ def test_a_really_full_disk(tmp_path):
         assert whole.read_bytes() == b"x" * 20_000
     finally:
         subprocess.run(["umount", str(disk)], check=True)
+
+
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+    """Only names of this package, only old ones; a link's target is nobody's business."""
+    old = time.time() - 2 * STALE
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (kept / "file").write_text("mine")
+    for name in (".probe-12", "..probe-12.12.tmp", ".probes", ".probe-x", "probe-12", ".publish", "data.tmp"):
+        (tmp_path / name).write_text("")
+    (tmp_path / ".publish-abc123").mkdir()
+    (tmp_path / ".publish-abc123" / "table.csv").write_text("")
+    (tmp_path / ".publish-link").symlink_to(kept, target_is_directory=True)
+    for path in tmp_path.iterdir():
+        os.utime(path, (old, old), follow_symlinks=False)
+    (tmp_path / ".publish-now").mkdir()
+    ensure_writable(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {".probes", ".probe-x", "probe-12", ".publish", "data.tmp", ".publish-now", "kept"}
+    assert (kept / "file").read_text() == "mine"
 
 
 def test_ensure_writable_refuses_what_cannot_be_written(tmp_path):

@@ -1,13 +1,16 @@
 """A film and a strip show the episode that was recorded, on machines that can draw."""
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from runs import evaluated
-from wbc_bench.errors import BenchError
+from wbc_bench.errors import BenchError, StoreError
 from wbc_bench.viewer import film
+from wbc_bench.viewer.film import strip_of, write_film_of
+from wbc_bench.viewer.picture import render, write_png
 from wbc_bench.viewer.rerun import Rerun, rerun
 
 
@@ -68,3 +71,27 @@ def test_a_film_has_a_picture_every_other_step(again: Rerun, strip: film.Pixels,
     assert frames == -(-len(again.moments) // film.EVERY) == len(seen)
     assert seconds == pytest.approx(frames / 25, abs=0.05)
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
+
+
+@pytest.mark.parametrize("what", ["film", "strip", "picture"])
+def test_a_full_disk_leaves_no_broken_file(again: Rerun, tmp_path: Path, what: str) -> None:
+    """And what was there stays: on a disk of 16 KiB, which none of them fits."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=16k", "none", str(disk)]
+    if subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("mounting a small disk needs root")
+    try:
+        path = disk / ("it.mp4" if what == "film" else "it.png")
+        path.write_bytes(b"before")
+        with pytest.raises(StoreError, match="cannot write") as caught:
+            if what == "film":
+                write_film_of(again, path)
+            elif what == "strip":
+                write_png(strip_of(again), path)
+            else:
+                render(again.robot, path)
+        assert "\n" not in str(caught.value)
+        assert [p.name for p in disk.iterdir()] == [path.name] and path.read_bytes() == b"before"
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)

@@ -118,3 +118,17 @@ def _end_output() -> None:
     except OSError:
         with contextlib.suppress(OSError):  # an output without a descriptor has nothing to try again
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def drawing() -> None:
+    """Before anything is drawn: MuJoCo loads the library that MUJOCO_GL names when it is imported.
+
+    Raises: UsageError, it cannot.
+    """
+    try:
+        import mujoco  # noqa: F401
+    except (ImportError, AttributeError) as error:
+        chosen = os.environ.get("MUJOCO_GL", "")
+        raise UsageError(
+            f"MuJoCo cannot draw with MUJOCO_GL={chosen} ({error}): install it or unset that"
+        ) from error

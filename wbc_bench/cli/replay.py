@@ -1,6 +1,5 @@
 """`wbc-bench replay` and `film`: an episode of a stored run again."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import Positional
 
-from wbc_bench.cli.common import RESULTS, UsageError, open_records
+from wbc_bench.cli.common import RESULTS, UsageError, drawing, open_records
 
 if TYPE_CHECKING:
     from wbc_bench.results.store import Run
@@ -76,19 +75,11 @@ class Film(_Again):
     not given."""
 
     def run(self) -> None:
-        from matplotlib import image
-
-        try:
-            import mujoco  # noqa: F401
-        except (ImportError, AttributeError) as error:  # it loads the library of MUJOCO_GL at once
-            chosen = os.environ.get("MUJOCO_GL", "")
-            raise UsageError(
-                f"MuJoCo cannot draw with MUJOCO_GL={chosen} ({error}): install it or unset that"
-            ) from error
-
+        drawing()
         from wbc_bench.files import write_atomic
         from wbc_bench.progress import Progress
         from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
+        from wbc_bench.viewer.picture import write_png
         from wbc_bench.viewer.rerun import rerun
 
         if self.out is None and self.strip is None:
@@ -108,6 +99,6 @@ class Film(_Again):
             print(self.out)
         if self.strip:
             pixels = strip_of(again, self.times)
-            image.imsave(self.strip, pixels, format="png", pil_kwargs={"pnginfo": None})
+            write_png(pixels, self.strip)
             write_atomic(self.strip.with_suffix(".txt"), strip_caption(again, self.times).encode())
             print(self.strip)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from wbc_bench.cli.common import drawing
+
 if TYPE_CHECKING:
     from wbc_bench.robot import RobotConfig
 
@@ -58,6 +60,7 @@ class Picture(_Robot):
     """Path of the picture to write, FILE.png."""
 
     def run(self) -> None:
+        drawing()
         from wbc_bench.files import ensure_writable
         from wbc_bench.robot import load_robot
         from wbc_bench.viewer.picture import render

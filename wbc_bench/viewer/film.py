@@ -35,7 +35,7 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
     Raises: BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
     """
     try:
-        from imageio_ffmpeg import write_frames
+        from imageio_ffmpeg import count_frames_and_secs, write_frames
     except ImportError as error:
         raise BenchError(missing_extra("a film", "film", error)) from error
     part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -57,9 +57,12 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
                 if progress is not None:
                     progress(number, len(shown), "filming")
             writer.close()
+        # the encoder says nothing where its disk is full
+        if count_frames_and_secs(str(part))[0] != len(shown):
+            raise OSError("the film was cut short: is the disk full?")
         part.replace(path)
-    except OSError as error:
-        raise StoreError(f"cannot write '{path}': {error}") from error
+    except (OSError, RuntimeError) as error:  # the second of a file that is no film
+        raise StoreError(f"cannot write '{path}': {' '.join(str(error).split())[:200]}") from error
     finally:
         part.unlink(missing_ok=True)
 

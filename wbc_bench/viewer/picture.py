@@ -1,5 +1,6 @@
 """A picture of the robot, drawn without a window."""
 
+import io
 import os
 import sys
 import warnings
@@ -11,6 +12,7 @@ from matplotlib import image
 from numpy.typing import NDArray
 
 from wbc_bench.errors import BenchError
+from wbc_bench.files import write_atomic
 from wbc_bench.robot import Robot
 
 Array = NDArray[np.float64]
@@ -25,7 +27,7 @@ def render(robot: Robot, path: Path, q: Array | None = None, size: tuple[int, in
     `q` are joint positions (14,) [rad], by default the default posture; the base is level.
 
     Raises:
-        BenchError: this machine cannot draw without a window.
+        BenchError: this machine cannot draw without a window, or the file cannot be written.
     """
     width, height = size
     model = robot.model()
@@ -48,7 +50,14 @@ def render(robot: Robot, path: Path, q: Array | None = None, size: tuple[int, in
 
     # no text in the file: equal pictures are equal bytes
     with Canvas(model, width, height) as canvas:
-        image.imsave(path, canvas.draw(scene), format="png", pil_kwargs={"pnginfo": None})
+        write_png(canvas.draw(scene), path)
+
+
+def write_png(pixels: NDArray[np.uint8], path: Path) -> None:
+    """Write a picture (height, width, 3), whole or not at all. Raises: StoreError."""
+    buffer = io.BytesIO()
+    image.imsave(buffer, pixels, format="png", pil_kwargs={"pnginfo": None})
+    write_atomic(path, buffer.getvalue())
 
 
 class Canvas:
