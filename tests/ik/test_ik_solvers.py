@@ -1,6 +1,8 @@
 """PlaCo and OSQP solve one and the same inverse-kinematics program."""
 
+import os
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -291,3 +293,26 @@ def test_half_planes_of_a_square():
     normal, offset = half_planes(square)
     np.testing.assert_allclose(normal, [[0, -1], [1, 0], [0, 1], [-1, 0]], atol=1e-15)
     np.testing.assert_allclose(offset, [0, 2, 1, 0], atol=1e-15)
+
+
+def test_placo_keeps_nothing_of_the_polygons_that_it_is_given() -> None:
+    """Its setter keeps every array for good: 0.5 KB a step, 39 MiB a shard, if it gets new ones."""
+    standing, solver = START, SOLVERS["placo"]
+
+    def resident() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**10
+
+    def steps(count: int) -> None:
+        for _ in range(count):
+            hull = standing.hull.copy()
+            assert (
+                solver.step(standing.q, standing.ee, standing.soles, hull, ROBOT.default_q, POSTURE)
+                is not None
+            )
+
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("no /proc here")
+    steps(200)
+    before = resident()
+    steps(3000)
+    assert resident() - before < 500  # [KiB]; it was 1500

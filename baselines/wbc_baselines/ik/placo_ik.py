@@ -56,6 +56,7 @@ class PlacoIK:
         self._com.configure("com", "soft", weights.com)
         self._polygon = solver.add_com_polygon_constraint([np.zeros(2)] * 3, weights.com_margin)
         self._polygon.configure("polygon", "hard")
+        self._corners: dict[int, list[Array]] = {}
         collisions = solver.add_avoid_self_collisions_constraint()
         collisions.configure("collisions", "soft", weights.collision)
         collisions.self_collisions_margin = weights.collision_margin
@@ -89,7 +90,11 @@ class PlacoIK:
             pitch.R_world_frame = flat.R_world_frame = rot
         self._centre[:2] = np.add.reduce(hull) / len(hull)  # np.mean takes four times as long
         self._com.target_world = self._centre
-        self._polygon.polygon = list(hull[::-1])  # PlaCo wants it clockwise
+        # PlaCo 0.10.2 never lets go of the arrays that it is given here: it gets the same ones every time
+        corners = self._corners.setdefault(len(hull), [np.zeros(2) for _ in hull])
+        for corner, point in zip(corners, hull[::-1], strict=True):  # it wants them clockwise
+            corner[:] = point
+        self._polygon.polygon = corners
         self._posture.set_joints(dict(zip(JOINT_NAMES, posture.tolist(), strict=True)))
         self._posture.configure("posture", "soft", posture_weight)
         solver.enable_velocity_limits(limit_speed)
