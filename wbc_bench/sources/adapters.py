@@ -1,7 +1,8 @@
 """Controller poses of four public stacks as targets: pure functions, one a message layout.
 
 Each takes the message as the builtins its own decoder gives (JSON, rosbridge) and returns what the sender
-held; `message.encode(..., relative=True)` then sends it as the motion of a device. Two conventions occur:
+held; `message.encode(..., relative=True)` then sends it as the motion of a device, which moves the target in
+the world along the axes of the base as it was when the clutch was engaged. Two conventions occur:
 
 - ROS, and ours: x forward, y left, z up. Source: REP 103.
 - OpenXR and WebXR: x right, y up, z backward. Source: WebXR Device API, section "Spaces".
@@ -10,6 +11,7 @@ A pose is carried over by a change of basis C on both sides, pos' = C pos and ro
 held level and straight ahead is the identity in both.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from wbc_bench.errors import SourceError
 from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix, wxyz_from_xyzw
 from wbc_bench.sources.interface import Frame, StampedTarget, unit
+from wbc_bench.sources.slew import Pose, between
 
 Array = NDArray[np.float64]
 Side = Literal["left", "right"]
@@ -176,8 +179,11 @@ def quest2ros(pose: Any, inputs: Any) -> Reading:
 # ---- UMI-on-Legs -------------------------------------------------------------------------------------------
 
 
+TICKS = 1 << 32  # the counter of milliseconds begins anew after 49.7 days
+
+
 class _EefState(msgspec.Struct):
-    tick: int
+    tick: Annotated[int, msgspec.Meta(ge=0, lt=TICKS)]
     eef_pose: Annotated[tuple[float, ...], msgspec.Meta(min_length=7, max_length=7)]
 
 
@@ -189,17 +195,38 @@ def umi_on_legs(value: Any) -> Sequence[StampedTarget]:
     """robot_state/EEFTraj of go2_arx5/eef_traj: frames of x, y, z, qw, qx, qy, qz in the world, tick in ms.
 
     The pose is that of UMI's tool frame, whose z points forward and y down; ours points x forward and z up.
+    The frames are a plan, most of them in the future: `due` says which one to send when. A tick counts from
+    when the robot's board was started; times [s] go on rising where it begins anew inside of a plan.
     Source: real-stanford/umi-on-legs@9992f32 real-wbc/ros2/robot_state/msg/EEFState.msg (order),
     real-wbc/modules/wbc_node.py (tcp2ee, tick / 1000).
 
     Raises: SourceError naming the field.
     """
-    frames = []
+    frames, time = [], 0.0
     for k, state in enumerate(_convert(value, _EefTraj, "UMI-on-Legs").traj):
         pos, quat = np.split(np.array(state.eef_pose), [3])
         rot = _matrix(quat, "UMI-on-Legs", f"$.traj[{k}].eef_pose") @ EE_FROM_UMI_TCP.T
-        frames.append(_target(state.tick * 1e-3, "world", pos, rot))
+        before, time = time, state.tick * 1e-3
+        if frames and time < before - TICKS * 0.5e-3:
+            time += TICKS * 1e-3
+        if frames and not time > before:
+            raise SourceError(f"UMI-on-Legs message: tick {state.tick} does not rise - at `$.traj[{k}].tick`")
+        frames.append(_target(time, "world", pos, rot))
     return frames
+
+
+def due(frames: Sequence[StampedTarget], time: float) -> StampedTarget:
+    """The pose of a plan at `time` [s] of its own clock, on straight lines and geodesics between its frames.
+
+    Before the first frame it is that of the first, after the last that of the last.
+    """
+    for before, after in itertools.pairwise(frames):
+        if before.time <= time < after.time:
+            part = (time - before.time) / (after.time - before.time)
+            a, b = (Pose(frame.pos, matrix_from_wxyz(frame.quat_wxyz)) for frame in (before, after))
+            pos, rot = between(a, b, part)
+            return StampedTarget(time, before.frame, pos, wxyz_from_matrix(rot))
+    return (frames[0] if time < frames[0].time else frames[-1])._replace(time=time)
 
 
 # ---- shared ------------------------------------------------------------------------------------------------

@@ -24,6 +24,12 @@ class Pose(NamedTuple):
     rot: Array  # (3, 3)
 
 
+def between(a: Pose, b: Pose, part: float) -> Pose:
+    """On the straight line and geodesic from a to b, 0 <= part <= 1."""
+    turn = matrix_from_rotvec(part * rotvec_from_matrix(a.rot.T @ b.rot))
+    return Pose(a.pos + part * (b.pos - a.pos), a.rot @ turn)
+
+
 def slew(now: Pose, goal: Pose, seconds: float, limits: Limits) -> Pose:
     """The pose after `seconds` [s] on the straight line and geodesic to a goal, each at most at its limit."""
     way = goal.pos - now.pos

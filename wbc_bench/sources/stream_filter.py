@@ -6,11 +6,15 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz, wxyz_from_matrix
-from wbc_bench.sources.interface import Frame, Seen, StampedTarget, from_world, to_world
+from wbc_bench.sources.clock_offset import ClockOffset
+from wbc_bench.sources.interface import Frame, Seen, StampedTarget, frame_pose, from_world, to_world
 from wbc_bench.sources.message import Message, MessageStatus, decode
 from wbc_bench.sources.slew import Limits, Pose, slew
+
+Array = NDArray[np.float64]
 
 
 class StreamConfig(NamedTuple):
@@ -19,9 +23,9 @@ class StreamConfig(NamedTuple):
     limits: Limits = Limits()  # of the target
     retreat: Limits = Limits(0.1, 0.4)  # [m/s], [rad/s] on the way to the safe pose
     hold_after: float = 0.25  # [s] of silence, until the target stays where it is
-    retreat_after: float = 5.0  # [s] of silence, until it goes back to where the hand was at the start
-    max_age: float = 0.25  # [s] between sending and receiving
-    max_lead: float = 0.05  # [s] a sender's clock may be ahead
+    retreat_after: float = 5.0  # [s] of silence, until it goes back to where the hand began; inf: never
+    max_age: float = 0.25  # [s] between sending and receiving, beyond that of the quickest message
+    max_lead: float = 0.05  # [s] a stamp may be ahead of what is known of the sender's clock
     max_distance: float = 1.6  # [m] from the base: legs and arm stretched
     max_jump: float = 0.5  # [m] between a message and the one before it
     max_turn: float = 1.6  # [rad] likewise, a little more than a quarter turn
@@ -42,8 +46,21 @@ class _Goal(NamedTuple):
     pose: Pose
 
 
+class _Anchor(NamedTuple):
+    """Where a device was engaged: what its motion is measured from, and the axes along which that counts."""
+
+    frame: Frame  # that the device speaks of
+    device: Pose  # in that frame
+    axes_w: Array  # (3, 3) of that frame when the device was engaged
+    start_w: Pose  # the target's
+
+
 class StreamFilter:
-    """The latest good message wins. Silence is measured by when messages come, not by what they say of it."""
+    """The latest good message wins. Silence is measured by when messages come, not by what they say of it.
+
+    A target that no message moves stays where it is in the world, wherever the robot goes: one that stayed on
+    a base that is led by it would be chased for ever.
+    """
 
     def __init__(
         self,
@@ -56,10 +73,11 @@ class StreamFilter:
         self._session: int | None = None
         self._ended: set[int] = set()
         self._sequence = -1
-        self._sent = np.nan  # [s] Unix time of the latest message that has not yet been used
-        self.latency = (
-            np.nan
-        )  # [s] from sending to the latest call of `target`; NaN when nothing new had come
+        self._offset = self._new_offset()  # of the session that is followed
+        self._stranger: tuple[int, ClockOffset] | None = None  # of the latest other one
+        self._sent = np.nan  # [s] stamp of the latest message that has not yet been used
+        # [s] from sending to the latest call of `target`, both on one clock; NaN when nothing new had come
+        self.latency = np.nan
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -74,12 +92,11 @@ class StreamFilter:
         self._safe = _Goal("base", Pose(*from_world(*self._now_w, "base", seen)))
         self.status = Status.WAITING
         self._received = -np.inf
-        self._anchor: tuple[_Goal, Pose] | None = (
-            None  # target and device at engaging, in the message's frame
-        )
+        self._anchor: _Anchor | None = None
 
     def take(self, parts: list[bytes], seen: Seen) -> MessageStatus:
-        """Take in one transmission. Only an accepted one changes anything but the counters."""
+        """Take in one transmission. Only an accepted one changes more than the counters and the estimate of
+        its sender's clock."""
         message = decode(parts)
         status = message if isinstance(message, MessageStatus) else self._judge(message, seen)
         self._counts[status] += 1
@@ -90,58 +107,70 @@ class StreamFilter:
         silence = self._clock() - self._received  # [s]
         limits = self._s.limits
         if self.status is not Status.WAITING and silence > self._s.retreat_after:
-            self.status, self._goal, self._anchor = Status.RETREATING, self._safe, None
+            if self.status is not Status.RETREATING:  # to a place in the world, or the robot's drift moves it
+                self.status, self._anchor = Status.RETREATING, None
+                self._goal = _Goal("world", self._in_world(self._safe, seen))
             limits = self._s.retreat
         elif self.status in (Status.FOLLOWING, Status.DISENGAGED) and silence > self._s.hold_after:
-            self.status, self._anchor = Status.HOLDING, None
-            self._goal = self._stay(self._goal.frame, seen)
+            self.status, self._anchor, self._goal = Status.HOLDING, None, self._stay()
         frame, goal = self._goal
         now = slew(Pose(*from_world(*self._now_w, frame, seen)), goal, time - self._time, limits)
-        if self.status in (Status.WAITING, Status.DISENGAGED, Status.HOLDING):
-            now = goal  # staying is not on the way to anywhere: in a moving frame it moves along
         target = StampedTarget(time, frame, now.pos, wxyz_from_matrix(now.rot))
         self._time, self._now_w = time, Pose(*to_world(target, seen))
         self.latency, self._sent = self._unix_time() - self._sent, np.nan
         return target
 
     def _judge(self, message: Message, seen: Seen) -> MessageStatus:
-        s, age = self._s, self._unix_time() - message.time
-        if age > s.max_age:
-            return MessageStatus.LATE
-        if age < -s.max_lead:
-            return MessageStatus.EARLY
-        now = self._clock()
         fresh = message.session != self._session
         if message.session in self._ended or (not fresh and message.sequence <= self._sequence):
             return MessageStatus.REPLAYED
-        if fresh and now - self._received <= s.hold_after:
+        offset = self._offset_of(message.session)
+        untimely = offset.judge(message.time, self._unix_time())
+        if untimely:
+            return MessageStatus(untimely)
+        now = self._clock()
+        if fresh and now - self._received <= self._s.hold_after:
             return MessageStatus.OCCUPIED
         goal, anchor = self._aim(message, self._anchor if not fresh else None, seen)
         if message.engaged and self._far(goal, seen):
             return MessageStatus.FAR
-        if fresh and self._session is not None:
-            self._ended.add(self._session)
+        if fresh:
+            if self._session is not None:
+                self._ended.add(self._session)
+            self._offset, self._stranger = offset, None
         self._session, self._sequence, self._received = message.session, message.sequence, now
         self._goal, self._anchor, self._sent = goal, anchor, message.time
         self.status = Status.FOLLOWING if message.engaged else Status.DISENGAGED
         return MessageStatus.ACCEPTED
 
-    def _aim(self, message: Message, anchor, seen: Seen) -> tuple[_Goal, tuple[_Goal, Pose] | None]:
+    def _new_offset(self) -> ClockOffset:
+        return ClockOffset(self._s.max_age, self._s.max_lead)
+
+    def _offset_of(self, session: int) -> ClockOffset:
+        if session == self._session:
+            return self._offset
+        if self._stranger is None or self._stranger[0] != session:
+            self._stranger = session, self._new_offset()
+        return self._stranger[1]
+
+    def _aim(self, message: Message, anchor: _Anchor | None, seen: Seen) -> tuple[_Goal, _Anchor | None]:
         """Where a message leads, and what its motion is measured from."""
         target = message.target
         device = Pose(target.pos, matrix_from_wxyz(target.quat_wxyz))
         if not message.engaged:
-            return self._stay(target.frame, seen), None
+            return self._stay(), None
         if not message.relative:
             return _Goal(target.frame, device), None
-        if anchor is None or anchor[0].frame != target.frame:
-            anchor = self._stay(target.frame, seen), device
-        (frame, start), origin = anchor
-        moved = Pose(start.pos + (device.pos - origin.pos), device.rot @ origin.rot.T @ start.rot)
-        return _Goal(frame, moved), anchor
+        if anchor is None or anchor.frame != target.frame:
+            _, axes_w = frame_pose(target.frame, seen)
+            anchor = _Anchor(target.frame, device, axes_w, self._now_w)
+        moved_w = anchor.axes_w @ (device.pos - anchor.device.pos)
+        turned_w = anchor.axes_w @ device.rot @ anchor.device.rot.T @ anchor.axes_w.T
+        start = anchor.start_w
+        return _Goal("world", Pose(start.pos + moved_w, turned_w @ start.rot)), anchor
 
-    def _stay(self, frame: Frame, seen: Seen) -> _Goal:
-        return _Goal(frame, Pose(*from_world(*self._now_w, frame, seen)))
+    def _stay(self) -> _Goal:
+        return _Goal("world", self._now_w)
 
     def _far(self, goal: _Goal, seen: Seen) -> bool:
         pos_w, rot_w = self._in_world(goal, seen)

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from wbc_bench.randomness import stream
 from wbc_bench.robot import Scene
-from wbc_bench.rotations import matrix_from_rotvec, rotvec_from_matrix, wxyz_from_matrix
+from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.sources.diffusion import poses
 from wbc_bench.sources.diffusion.demonstrations import GRIPPER_WIDTH, door_state
 from wbc_bench.sources.diffusion.policy import ACTION, HORIZON, PERIOD, Policy, look
 from wbc_bench.sources.diffusion.scene import Door, DoorScene
 from wbc_bench.sources.interface import Seen, StampedTarget
-from wbc_bench.sources.slew import Pose
+from wbc_bench.sources.slew import Pose, between
 
 Array = NDArray[np.float64]
 EXECUTED = 8  # poses of a chunk until the next one is made
@@ -55,7 +55,7 @@ class DiffusionSource:
             self._plan(time)
         place = (time - self._planned) / PERIOD
         k = min(int(place), HORIZON - 2)
-        pos, rot = poses.hand(_between(self._chunk[k], self._chunk[k + 1], place - k))
+        pos, rot = poses.hand(between(self._chunk[k], self._chunk[k + 1], place - k))
         return StampedTarget(time, "world", pos, wxyz_from_matrix(rot))
 
     def close(self) -> None:
@@ -76,9 +76,3 @@ class DiffusionSource:
         chunk = self._policy.chunk(seen[None], noise)[0].double().numpy()
         pos, rot = poses.absolute(poses.pose_of(chunk[:, : poses.POSE]), now)
         self._chunk, self._planned = [Pose(p, r) for p, r in zip(pos, rot, strict=True)], time
-
-
-def _between(a: Pose, b: Pose, part: float) -> Pose:
-    """On the straight line and geodesic from a to b."""
-    turn = matrix_from_rotvec(part * rotvec_from_matrix(a.rot.T @ b.rot))
-    return Pose(a.pos + part * (b.pos - a.pos), a.rot @ turn)

@@ -1,0 +1,46 @@
+"""How far the clock of a sender is from this machine's, so that the age of its messages can be told."""
+
+from typing import Literal
+
+DRIFT = 1e-3  # [1] by which two clocks may run apart; quartz keeps to 1e-4
+
+
+class ClockOffset:
+    """The offset of one session, from stamps alone.
+
+    Receiving minus sending is offset plus delay, and no delay is negative: the smallest difference seen so
+    far is the best estimate of the offset, and what a message exceeds it by is its age. So a clock may count
+    from anywhere, as ticks of a board do, but a delay that all messages share cannot be told.
+    Source: Mills et al. 2010, RFC 5905, section 10 (the clock filter takes the sample of least delay).
+
+    A stamp that disagrees with what is known is refused, unless the one before it disagreed alike: one wrong
+    stamp moves nothing, and a clock that has been set costs one message.
+    """
+
+    def __init__(self, max_age: float, max_lead: float) -> None:
+        """Args: see `StreamConfig`."""
+        self._max_age, self._max_lead = max_age, max_lead  # [s]
+        self._offset: float | None = None  # [s] unknown until a stamp has been taken
+        self._received = 0.0  # [s] when it was last confirmed
+        self._refused: float | None = None  # [s] difference of the stamp refused last
+
+    def judge(self, sent: float, received: float) -> Literal["late", "early"] | None:
+        """Take in the stamps [s] of a message, each of its own clock.
+
+        Returns: what makes it unfit, or None.
+        """
+        difference = received - sent
+        alike = self._refused is not None and abs(difference - self._refused) <= self._max_lead
+        known = 0.0  # at first the clocks are taken to agree
+        if self._offset is not None:
+            known = self._offset + DRIFT * max(received - self._received, 0.0)
+        late = difference > known + self._max_age
+        # a stamp that is not ahead of this machine's clock is never too early
+        early = difference < min(known, 0.0) - self._max_lead
+        # messages that a network held up are late alike as well: once the offset is known, they stay refused
+        if (early and not alike) or (late and not (alike and self._offset is None)):
+            self._refused = difference
+            return "late" if late else "early"
+        self._offset = difference if self._offset is None else min(known, difference)
+        self._received, self._refused = received, None
+        return None
