@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ from commands import fails
 from wbc_bench.cli.main import main
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.episodes.single import _protocol, _row
-from wbc_bench.errors import StoreError
+from wbc_bench.errors import SourceError, StoreError
 from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.evaluation.tracking import follow, natural_duration, track
 from wbc_bench.registry import load_controller
@@ -189,6 +191,38 @@ def test_a_run_lasts_until_its_script_has_ended() -> None:
     assert asked == natural_duration(source) == pytest.approx(np.ceil(source.path.duration + 2.0))  # pyright: ignore[reportAttributeAccessIssue]
 
 
+class Refusing(Still):
+    """Counts a message at every step, of which it accepts those that the test says."""
+
+    def __init__(self, accepted: Sequence[bool]) -> None:
+        super().__init__(np.array([0.4, 0.0, 1.1]))
+        self.accepted = list(accepted)
+        self.counters = {"accepted": 100, "early": 100}  # of an earlier run
+
+    def target(self, time: float, seen: Seen) -> StampedTarget:
+        if self.accepted:
+            self.counters["accepted" if self.accepted.pop() else "early"] += 1
+        return super().target(time, seen)
+
+
+@pytest.mark.parametrize("accepted", [[True, False] * 3, [True]])
+def test_a_run_that_used_half_of_its_messages_is_scored(accepted: list[bool]) -> None:
+    track(Swing(), Refusing(accepted), "nominal", 0, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("accepted", "said"),
+    [
+        ([True, False, False], "3 messages: 1 accepted, 2 early"),
+        ([], "0 messages: none"),
+        ([False], "1 early"),
+    ],
+)
+def test_a_run_that_used_fewer_is_refused(accepted: list[bool], said: str) -> None:
+    with pytest.raises(SourceError, match=f"{said}.*valid: at least one message and 50% of all"):
+        track(Swing(), Refusing(accepted), "nominal", 0, 0.2)
+
+
 def test_ik_follows_a_script_and_the_same_script_through_the_stream() -> None:
     """Seconds of a slow curve: to 5 cm, through a file as through a socket."""
     for name in ("figure_eight", "stream:figure_eight"):
@@ -296,6 +330,44 @@ def test_track_writes_record_table_and_figure(capsys, tmp_path: Path) -> None:
     main(["report", "--results", str(tmp_path)])
     after = (tmp_path / "tables/tracking.csv").read_bytes(), (tmp_path / "figures/tracking.png").read_bytes()
     assert before == after and "Tracking of moving targets" in (tmp_path / "report.html").read_text()
+
+
+def test_track_says_what_became_of_the_messages(capsys, tmp_path: Path) -> None:
+    run_track(tmp_path, "--source", "stream:figure_eight", "--address", "tcp://127.0.0.1:*")
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if " messages: " in line]
+    assert re.fullmatch(r"hold, stream:figure_eight: \d+ messages: \d+ accepted.*", line), line
+
+
+@pytest.mark.parametrize("sent", ["nothing", "nonsense"])
+def test_a_stream_that_was_not_followed_is_no_record(capsys, tmp_path: Path, sent: str) -> None:
+    with zmq.Context() as context, context.socket(zmq.PUSH) as client:
+        address = f"ipc://{tmp_path / 's'}"
+        client.setsockopt(zmq.LINGER, 0)
+        client.connect(address)
+        if sent == "nonsense":
+            for _ in range(20):
+                client.send(b"up, please")
+        words = ("--controller", "hold", "--source", "stream", "--address", address, "--out", tmp_path)
+        line = fails(capsys, "track", *words, "--duration", 0.4)
+    assert "--source stream: " in line and "is not scored" in line
+    assert not list(tmp_path.rglob("track.json"))
+
+
+@pytest.mark.parametrize(("choice", "seconds"), [("retreat", 5.0), ("hold", np.inf)])
+def test_what_a_silent_stream_does_is_an_option(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, choice: str, seconds: float
+) -> None:
+    made = []
+
+    def spied(*args, **kwargs):
+        source = load_source(*args, **kwargs)
+        made.append(source)
+        return source
+
+    monkeypatch.setattr("wbc_bench.sources.registry.load_source", spied)
+    words = ("--source", "stream:figure_eight", "--address", "tcp://127.0.0.1:*", "--on-silence", choice)
+    run_track(tmp_path, *words)
+    assert [source._stream.filter._s.retreat_after for source in made] == [seconds]
 
 
 def test_mistakes_are_one_line(capsys, tmp_path: Path) -> None:

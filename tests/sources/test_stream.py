@@ -3,6 +3,7 @@
 import math
 import pickle
 import re
+import socket as sockets
 import subprocess
 import sys
 import time
@@ -399,6 +400,47 @@ def test_a_busy_port_is_named(stream: StreamSource) -> None:
         SourceError, match=re.escape(f"'{stream.address}' cannot be opened: Address already in use")
     ):
         StreamSource(stream.address)
+
+
+def test_a_file_in_the_way_of_an_ipc_address_is_kept(tmp_path: Path) -> None:
+    """ZeroMQ itself would remove it, and take the place of a socket that is in use."""
+    for file in (tmp_path / "notes.txt", tmp_path / "link"):
+        if file.name == "link":
+            file.symlink_to(tmp_path / "notes.txt")
+        else:
+            file.write_text("mine")
+        with pytest.raises(SourceError, match=re.escape(f"'{file}' exists and is no socket")):
+            StreamSource(f"ipc://{file}")
+        assert file.read_text() == "mine"
+    with pytest.raises(SourceError, match="exists and is no socket"):
+        StreamSource(f"ipc://{tmp_path}")
+
+
+def test_an_ipc_address_in_use_is_named_and_one_left_behind_is_taken(tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path / 's'}"
+    with sockets.socket(sockets.AF_UNIX) as left:  # bound, and never listened to again
+        left.bind(str(tmp_path / "s"))
+    source = StreamSource(address)
+    try:
+        with pytest.raises(SourceError, match="Address already in use"):
+            StreamSource(address)
+        with zmq.Context() as context, context.socket(zmq.PUSH) as client:  # and it still listens
+            client.setsockopt(zmq.LINGER, 0)
+            client.connect(address)
+            client.send(b"no message")
+            source.reset(SEEN)
+            deadline = time.monotonic() + 20.0
+            while source.counters["malformed"] < 1:
+                assert time.monotonic() < deadline
+                source.target(0.0, SEEN)
+    finally:
+        source.close()
+
+
+def test_what_waits_to_be_read_is_bounded(stream: StreamSource) -> None:
+    """In transmissions a client, and in bytes a transmission: 1 MiB."""
+    most = stream._socket.getsockopt(zmq.RCVHWM) * stream._socket.getsockopt(zmq.MAXMSGSIZE)  # pyright: ignore[reportOperatorIssue]
+    assert 0 < most <= 1 << 20 and stream._socket.getsockopt(zmq.MAXMSGSIZE) >= MAX_BYTES  # pyright: ignore[reportOperatorIssue]
 
 
 # documents and numbers

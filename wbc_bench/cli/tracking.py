@@ -1,9 +1,10 @@
 """`wbc-bench track` and `live`: a controller follows a moving target."""
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 from tyro.conf import FlagCreatePairsOff
@@ -34,6 +35,9 @@ class Track:
     of ablation_v1)."""
     address: str = "tcp://127.0.0.1:5601"
     """ZeroMQ address at which a stream listens."""
+    on_silence: Literal["retreat", "hold"] = "retreat"
+    """What the target of a stream does after 5 s without an accepted message: go back to where the hand was
+    at the start, or stay where it is in the world."""
     port: int = 8080
     """TCP port of the page of `live`, 1 to 65535."""
     allow_remote: FlagCreatePairsOff[bool] = False
@@ -75,13 +79,17 @@ class Track:
         """Let a controller follow a source of a name; the series, and what the record says beside it."""
         from wbc_bench.episodes.single import door_protocol
         from wbc_bench.errors import SourceError
-        from wbc_bench.evaluation.tracking import facts, track
+        from wbc_bench.evaluation.tracking import counters_text, facts, track
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.registry import load_source
+        from wbc_bench.sources.stream_filter import StreamConfig
 
         controller = load_controller(spec, load_robot())
-        source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed))
+        stream = StreamConfig()
+        if self.on_silence == "hold":
+            stream = stream._replace(retreat_after=math.inf)
+        source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed), stream)
         if self.allow_remote and source.live:
             print(f"listening on {self.address}: whoever can send there moves the robot", file=sys.stderr)
         try:
@@ -90,6 +98,8 @@ class Track:
             raise UsageError(f"--source {name}: {error}") from error
         finally:
             source.close()
+        if source.counters:
+            print(f"{spec}, {name}: {counters_text(source.counters)}")
         return tracked, facts(controller, spec, source, self.condition, self.seed) | {"requested_s": asked}
 
     def _drag(self, spec: str) -> "tuple[Tracked, dict]":

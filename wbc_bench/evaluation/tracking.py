@@ -2,7 +2,7 @@
 
 import math
 import time as clocks
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,18 +13,20 @@ from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.single import CONDITIONS, UNSCRIPTED, _protocol, _row, episode_of
-from wbc_bench.errors import UnknownNameError
+from wbc_bench.errors import SourceError, UnknownNameError
 from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
 from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
+from wbc_bench.sources.message import MessageStatus
 from wbc_bench.sources.registry import recorded_name
 from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import ScriptedSource
 
 Array = NDArray[np.float64]
 STAY = 2.0  # [s] after the end of a script
+MIN_USED = 0.5  # of the messages that came in a run that is scored; choice
 
 
 def track(
@@ -36,14 +38,33 @@ def track(
 
     Raises:
         UnknownNameError: no such condition.
-        SourceError: a duration that is not positive.
+        SourceError: a duration that is not positive, or a run that says nothing of the controller: no message
+            came, or fewer than MIN_USED of them were accepted.
         ControllerError: see `ControlLoop`.
     """
     if condition not in CONDITIONS:
         raise UnknownNameError("condition", condition, CONDITIONS, "--condition")
     if duration is None:
         duration = natural_duration(source)
-    return follow(controller, source, *episode_of(duration, seed, condition)), duration
+    episode, before = episode_of(duration, seed, condition), dict(source.counters)
+    tracked = follow(controller, source, *episode)
+    _check_used({name: count - before[name] for name, count in source.counters.items()})
+    return tracked, duration
+
+
+def _check_used(counts: Mapping[str, int]) -> None:
+    """Refuse to score the target that stood still because its messages were refused."""
+    if counts and counts[MessageStatus.ACCEPTED] < max(MIN_USED * sum(counts.values()), 1):
+        raise SourceError(
+            f"{counters_text(counts)}; valid: at least one message and {MIN_USED:.0%} of all accepted, "
+            "a run of fewer is not scored"
+        )
+
+
+def counters_text(counts: Mapping[str, int]) -> str:
+    """Messages of a run by what became of them, as one line."""
+    parts = [f"{count} {name}" for name, count in counts.items() if count]
+    return f"{sum(counts.values())} messages: {', '.join(parts) or 'none'}"
 
 
 class Moment(NamedTuple):

@@ -48,7 +48,7 @@ class Source(Protocol):
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """What came in, by what became of it; empty where nothing comes in."""
+        """Messages by what became of them, `accepted` among others; empty where nothing comes in."""
         ...
 
     def reset(self, seen: Seen) -> None:

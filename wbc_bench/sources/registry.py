@@ -12,6 +12,7 @@ from wbc_bench.sources.live import LIVE, LiveSource
 from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
+from wbc_bench.sources.stream_filter import StreamConfig
 
 if TYPE_CHECKING:
     from wbc_bench.sources.diffusion.policy import DoorPolicyCard, Policy
@@ -70,10 +71,16 @@ def check_source(name: str) -> None:
 
 
 def load_source(
-    name: str, address: str = ADDRESS, allow_remote: bool = False, protocol: EvalProtocol | None = None
+    name: str,
+    address: str = ADDRESS,
+    allow_remote: bool = False,
+    protocol: EvalProtocol | None = None,
+    config: StreamConfig = StreamConfig(),  # noqa: B008  (immutable)
 ) -> Source:
     """The source of a name: `live`, `stream`, a script of the library or of a .toml file, `stream:SCRIPT`, or
     `diffusion[:FILE]`, which stands in front of the first door of the protocol's seed.
+
+    Address, `allow_remote` and `config` are those of a stream.
 
     Raises: UnknownNameError (with the nearest names), SourceError.
     """
@@ -88,10 +95,10 @@ def load_source(
     if name == LIVE:
         return LiveSource()
     if name == "stream":
-        return StreamSource(address, allow_remote=allow_remote)
+        return StreamSource(address, config, allow_remote)
     if name.startswith("stream:"):
         script = ScriptedSource(find_script(name.removeprefix("stream:")))
-        return ReplayedStream(script, StreamSource(address, allow_remote=allow_remote))
+        return ReplayedStream(script, StreamSource(address, config, allow_remote))
     return ScriptedSource(find_script(name))
 
 

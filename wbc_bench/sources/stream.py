@@ -1,6 +1,9 @@
 """Targets over ZeroMQ on this machine: `wbc-bench track --source stream`; the messages are in STREAM.md."""
 
 import ipaddress
+import os
+import socket as sockets
+import stat
 from collections.abc import Mapping
 
 from wbc_bench.errors import SourceError, missing_extra
@@ -9,7 +12,8 @@ from wbc_bench.sources.stream_filter import Status, StreamConfig, StreamFilter
 
 ADDRESS = "tcp://127.0.0.1:5601"
 MAX_DRAIN = 5000  # transmissions taken in at once: a flood must not stop the control loop
-MAX_TRANSMISSION = 1 << 20  # [bytes] ZeroMQ drops a client that sends more at once
+MAX_TRANSMISSION = 4096  # [bytes] ZeroMQ drops a client that sends more in one part; a message may have 1024
+MAX_WAITING = 256  # transmissions of a client that wait to be read, 1 MiB; the others wait at the client
 
 
 def is_local(address: str) -> bool:
@@ -29,6 +33,30 @@ def has_port(address: str) -> bool:
     transport, _, rest = address.partition("://")
     port = rest.rpartition(":")[2]
     return transport != "tcp" or port == "*" or (port.isdecimal() and int(port) < 1 << 16)
+
+
+def check_free(address: str) -> None:
+    """Whether an ipc address is free: ZeroMQ removes whatever file is in its way, and whoever listens there.
+
+    Raises: SourceError, a file stands there that is no socket, or one that is in use.
+    """
+    transport, _, path = address.partition("://")
+    if transport != "ipc" or path.startswith(("@", "*")):  # abstract, or any free name
+        return
+    try:
+        mode = os.lstat(path).st_mode
+    except (OSError, ValueError):
+        return  # nothing there, or no name of a file: binding says so
+    if not stat.S_ISSOCK(mode):
+        raise SourceError(
+            f"stream address '{address}': '{path}' exists and is no socket, valid: a path that does not exist"
+        )
+    with sockets.socket(sockets.AF_UNIX) as probe:
+        try:
+            probe.connect(path)
+        except OSError:
+            return  # left behind by a process that has ended
+    raise SourceError(f"stream address '{address}' cannot be opened: Address already in use")
 
 
 class StreamSource:
@@ -57,6 +85,7 @@ class StreamSource:
                 f"stream address '{address}' can be reached from other machines, valid: loopback, "
                 f"e.g. {ADDRESS}; --allow-remote opens it to whoever can send there"
             )
+        check_free(address)
         try:
             import zmq
         except ImportError as error:
@@ -66,6 +95,7 @@ class StreamSource:
         self._socket = self._context.socket(zmq.PULL)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_TRANSMISSION)
+        self._socket.setsockopt(zmq.RCVHWM, MAX_WAITING)
         try:
             self._socket.bind(address)
         except zmq.ZMQError as error:
