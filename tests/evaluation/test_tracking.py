@@ -378,6 +378,11 @@ def test_mistakes_are_one_line(capsys, tmp_path: Path) -> None:
     bad = tmp_path / "bad.toml"
     bad.write_text('name = "bad"\ndescription = ""\nlimits = { linear = -1, angular = 1 }\n')
     assert "$.limits.linear" in fails(capsys, *base, "--source", bad)
+    bad.write_text(
+        'name = "slow"\ndescription = ""\nlimits = { linear = 1e-300, angular = 1.0 }\n'
+        'path = { type = "waypoints", points = [{ pos = [0.4, 0.0, 1.0] }] }\n'
+    )
+    assert "s, valid: at most 598 s" in fails(capsys, *base, "--source", bad)
     figure = (*base, "--source", "figure_eight")
     assert "did you mean nominal or randomised?" in fails(capsys, *figure, "--condition", "nominl")
     assert "duration -1 s" in fails(capsys, *figure, "--duration", -1)

@@ -162,6 +162,25 @@ pos = [0.4, 0.0, 1.0]
             'type = "curve"\ncentre = [0.4, 0.0, 1.0]\namplitude = [0.1, 0.0, 0.0]\ncycles = [0, 1, 1]\n',
             "$.path.amplitude",
         ),
+        ('type = "waypoints"', 'type = "waypoints"\nloops = 1001', "$.path.loops"),
+        ('type = "waypoints"', 'type = "waypoints"\nloops = 4000000000000', "$.path.loops"),
+        (
+            'type = "waypoints"',
+            'type = "waypoints"\nloops = 1000\n' + "[[path.points]]\npos = [0.4, 0.0, 1.0]\n" * 10,
+            "11 points in 1000 loops are 11000 poses, valid: at most 10000 - at `$.path.loops",
+        ),
+        (
+            GOOD[GOOD.index("type") :],
+            'type = "curve"\ncentre = [0.4, 0.0, 1.0]\namplitude = [0.1, 0.0, 0.0]\ncycles = [1, 0, 0]\n'
+            "laps = 1001\n",
+            "$.path.laps",
+        ),
+        (
+            GOOD[GOOD.index("type") :],
+            'type = "board"\ncentre = [0.4, 0.0, 1.0]\nwidth = 0.1\nheight = 0.1\nstrokes = 1001\n',
+            "$.path.strokes",
+        ),
+        ("pos = [0.4, 0.0, 1.0]", "pos = [0.4, 0.0, 1e300]", "$.path.points[0].pos[2]"),
     ],
 )
 def test_bad_scripts_name_the_field(tmp_path: Path, old: str, new: str, where: str) -> None:

@@ -12,7 +12,7 @@ from wbc_bench import provenance
 from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.episodes.single import CONDITIONS, UNSCRIPTED, _protocol, _row, episode_of
+from wbc_bench.episodes.single import CONDITIONS, LONGEST, UNSCRIPTED, _protocol, _row, episode_of
 from wbc_bench.errors import SourceError, UnknownNameError
 from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
 from wbc_bench.evaluation.simulation import Simulation, State
@@ -133,7 +133,10 @@ def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
 
 
 def natural_duration(source: Source) -> float:
-    """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources."""
+    """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources.
+
+    Raises: SourceError, the script lasts longer than an episode may.
+    """
     script = source.script if isinstance(source, ScriptedSource | ReplayedStream) else None
     if script is None:
         return UNSCRIPTED
@@ -141,6 +144,11 @@ def natural_duration(source: Source) -> float:
     state = Simulation(protocol, _row(protocol, "nominal")).state()
     played = ScriptedSource(script)
     played.reset(seen_of(state, load_robot(protocol.robot)))
+    if not played.path.duration + STAY <= LONGEST:
+        raise SourceError(
+            f"the script lasts {played.path.duration:.4g} s, valid: at most {LONGEST - STAY:g} s, "
+            "or a duration that plays a part of it"
+        )
     return math.ceil(played.path.duration + STAY)
 
 

@@ -20,7 +20,10 @@ from wbc_bench.sources.slew import Limits, Pose
 Vec3 = tuple[float, float, float]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NonNegative = Annotated[float, msgspec.Meta(ge=0)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
+MAX_REPEATS = 1000  # loops, laps or strokes of a script
+MAX_POSES = 10_000  # of a script, all loops counted: each is laid out before the episode begins
+LARGEST = 1e6  # size of a number of a script [m], [rad], [s]: beyond it durations drown in rounding
+Count = Annotated[int, msgspec.Meta(ge=1, le=MAX_REPEATS)]
 Cycles = Annotated[int, msgspec.Meta(ge=0, le=MAX_CYCLES)]
 
 
@@ -51,7 +54,7 @@ class Waypoint(_Table, frozen=True):
 class Waypoints(_Table, frozen=True, tag="waypoints"):
     """Straight lines between poses, from the first to the last, `loops` times."""
 
-    points: Annotated[tuple[Waypoint, ...], msgspec.Meta(min_length=1)]
+    points: Annotated[tuple[Waypoint, ...], msgspec.Meta(min_length=1, max_length=MAX_POSES)]
     loops: Count = 1
 
     def pieces(self, limits: Limits) -> list[Piece]:
@@ -86,7 +89,7 @@ class Board(_Table, frozen=True, tag="board"):
     centre: Vec3  # [m]
     width: Positive  # [m] of a stroke
     height: Positive  # [m] from the first stroke to the last
-    strokes: Annotated[int, msgspec.Meta(ge=2)]
+    strokes: Annotated[int, msgspec.Meta(ge=2, le=MAX_REPEATS)]
     rpy: Vec3 = (0.0, 0.0, 0.0)  # [rad] of the hand
 
     def pieces(self, limits: Limits) -> list[Piece]:
@@ -126,7 +129,7 @@ def load_script(path: File) -> Script:
 
 
 def _check(script: Script, path: File) -> None:
-    """What a type cannot say: finite numbers, and something that moves."""
+    """What a type cannot say: numbers of a sensible size, not too many poses, and something that moves."""
 
     def refuse(problem: str, where: str) -> NoReturn:
         raise SourceError(f"source {path}: {problem} - at `${where}`")
@@ -143,9 +146,16 @@ def _check(script: Script, path: File) -> None:
                 walk(item, f"{where}[{k}]")
         elif isinstance(value, float) and not math.isfinite(value):
             refuse(f"{value} is not a finite number", where)
+        elif isinstance(value, float) and abs(value) > LARGEST:
+            refuse(f"{value:g}, valid: {-LARGEST:g} to {LARGEST:g}", where)
 
     walk(script, "")
     curve = script.path
+    if isinstance(curve, Waypoints):
+        poses = len(curve.points) * curve.loops
+        if poses > MAX_POSES:
+            asked = f"{len(curve.points)} points in {curve.loops} loops are {poses} poses"
+            refuse(f"{asked}, valid: at most {MAX_POSES}", ".path.loops")
     if isinstance(curve, Curve) and not np.multiply(curve.amplitude, curve.cycles).any():
         refuse("no axis has both an amplitude and cycles, so nothing moves", ".path.amplitude")
 
