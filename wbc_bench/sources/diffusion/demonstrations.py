@@ -1,6 +1,5 @@
 """Demonstrations on disk in UMI's zarr layout; README.md explains it field by field."""
 
-import hashlib
 import io
 import zipfile
 from pathlib import Path
@@ -9,10 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.errors import SourceError, missing_extra
+from wbc_bench.errors import SourceError
 from wbc_bench.files import write_atomic
 from wbc_bench.rotations import matrix_from_rotvec, rotvec_from_matrix
 from wbc_bench.sources.diffusion import poses
+from wbc_bench.sources.diffusion.zarr_archive import MAX_ROWS, read_archive, zarr_module
 from wbc_bench.sources.slew import Pose
 
 Array = NDArray[np.float64]
@@ -30,6 +30,13 @@ LAYOUT = {  # array -> (columns, type)
 EPOCH = (1980, 1, 1, 0, 0, 0)  # of every zip entry: equal demonstrations are equal bytes
 
 
+# what is read: number of columns, 0 for (E,); start and end poses follow from the others
+WANTED = {f"data/{name}": LAYOUT[name][0] for name in LAYOUT if not name.startswith("robot0_demo")}
+WANTED["meta/episode_ends"] = 0
+LARGEST = 1e3  # size of a number, [m] or [rad]; choice
+LEAST_AREA = 0.5  # between two rows that should be at right angles; choice
+
+
 class Demonstration(NamedTuple):
     """T control steps of one episode, poses of the hand in the world."""
 
@@ -37,6 +44,13 @@ class Demonstration(NamedTuple):
     target: Pose  # (T, 3) [m], (T, 3, 3) what the expert asked for
     panel: Pose  # (T, 3) [m], (T, 3, 3) the door's frame
     angle: Array  # (T,) [rad]
+    # (T, 2) [m] between the fingers, as it was and as asked for; None: fingers that stay at GRIPPER_WIDTH
+    width: Array | None = None
+
+    @property
+    def widths(self) -> Array:
+        """(T, 2) [m] between the fingers, as it was and as asked for."""
+        return np.full((len(self.angle), 2), GRIPPER_WIDTH) if self.width is None else self.width
 
 
 class Demonstrations(NamedTuple):
@@ -56,11 +70,13 @@ def door_state(panel: Pose, angle: Array, ee: Pose) -> Array:
 def write_demonstrations(path: Path, episodes: list[Demonstration], attributes: dict[str, Any]) -> None:
     """Write a zip of zarr version 2, uncompressed; equal demonstrations give equal bytes.
 
-    Raises: SourceError when there is none, or zarr is missing; StoreError.
+    Raises: SourceError when there is none, too many steps, or zarr is missing; StoreError.
     """
-    zarr = _zarr()
-    if not episodes:
-        raise SourceError(f"no demonstration to write to '{path}'")
+    zarr = zarr_module()
+    steps = sum(len(episode.angle) for episode in episodes)
+    if not 0 < steps <= MAX_ROWS:
+        found = f"{steps} steps" if episodes else "no demonstration"
+        raise SourceError(f"{found} to write to '{path}', valid: 1 to {MAX_ROWS} steps")
     parts = [_columns(episode) for episode in episodes]
     entries: dict[str, Any] = {}
     root = zarr.create_group(store=zarr.storage.MemoryStore(entries), zarr_format=2)
@@ -81,37 +97,25 @@ def write_demonstrations(path: Path, episodes: list[Demonstration], attributes: 
 
 
 def read_demonstrations(path: Path) -> Demonstrations:
-    """The demonstrations of a file.
+    """The demonstrations of a file of `demo record`, or of UMI's tools with `data/door_state` added.
 
-    Raises: SourceError when it is missing, no zip of zarr, or an array is missing, of another shape, or not
-    finite.
+    Without `data/action` the poses themselves are what is asked for, as UMI's sampler takes them.
+
+    Raises: SourceError, see `read_archive`; or numbers that are none, lengths that differ, no rotation.
     """
-    zarr = _zarr()
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise SourceError(f"demonstrations '{path}' cannot be read: {error.strerror}") from error
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            broken = archive.testzip()  # zarr takes a damaged chunk as it is
-        if broken is not None:
-            raise ValueError(f"checksum of '{broken}'")
-        store = zarr.storage.ZipStore(path, mode="r")
-        try:
-            root = zarr.open_group(store, mode="r", zarr_format=2)
-            arrays = {name: np.asarray(root[f"data/{name}"][:], dtype=float) for name in LAYOUT}
-            ends = np.asarray(root["meta/episode_ends"][:])
-            attributes = dict(root.attrs)
-        finally:
-            store.close()
-    except (zipfile.BadZipFile, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise SourceError(f"demonstrations '{path}' are damaged, valid: a zarr v2 zip: {error}") from error
+    found = read_archive(path, WANTED, frozenset({"data/action"}))
+    arrays = {name.removeprefix("data/"): value for name, value in found.arrays.items()}
+    ends = arrays.pop("meta/episode_ends").astype(np.int64)
+    arrays = {name: value.astype(float) for name, value in arrays.items()}
+    if "action" not in arrays:
+        parts = ("robot0_eef_pos", "robot0_eef_rot_axis_angle", "robot0_gripper_width")
+        arrays["action"] = np.concatenate([arrays[name] for name in parts], axis=-1)
     _check(path, arrays, ends)
-    parts = [
+    episodes = [
         _demonstration({name: value[start:end] for name, value in arrays.items()})
         for start, end in zip([0, *ends[:-1]], ends, strict=True)
     ]
-    return Demonstrations(parts, attributes, hashlib.sha256(data).hexdigest())
+    return Demonstrations(episodes, found.attributes, found.sha256)
 
 
 def _columns(episode: Demonstration) -> dict[str, Array]:
@@ -119,14 +123,14 @@ def _columns(episode: Demonstration) -> dict[str, Array]:
     ee, target = poses.tool(episode.ee), poses.tool(episode.target)
     count = len(episode.angle)
     axis_angle = np.concatenate([ee.pos, rotvec_from_matrix(ee.rot)], axis=-1)
-    width = np.full((count, 1), GRIPPER_WIDTH)
+    width, asked = np.split(episode.widths, 2, axis=-1)
     return {
         "robot0_eef_pos": axis_angle[:, :3],
         "robot0_eef_rot_axis_angle": axis_angle[:, 3:],
         "robot0_gripper_width": width,
         "robot0_demo_start_pose": np.tile(axis_angle[0], (count, 1)),
         "robot0_demo_end_pose": np.tile(axis_angle[-1], (count, 1)),
-        "action": np.concatenate([target.pos, rotvec_from_matrix(target.rot), width], axis=-1),
+        "action": np.concatenate([target.pos, rotvec_from_matrix(target.rot), asked], axis=-1),
         "door_state": door_state(episode.panel, episode.angle, episode.ee),
     }
 
@@ -136,25 +140,21 @@ def _demonstration(arrays: dict[str, Array]) -> Demonstration:
     action, door = arrays["action"], arrays["door_state"]
     panel = poses.absolute(poses.pose_of(door[:, : poses.POSE]), ee)
     target = Pose(action[:, :3], matrix_from_rotvec(action[:, 3:6]))
-    return Demonstration(poses.hand(ee), poses.hand(target), panel, door[:, -1])
+    width = np.concatenate([arrays["robot0_gripper_width"], action[:, 6:]], axis=-1)
+    return Demonstration(poses.hand(ee), poses.hand(target), panel, door[:, -1], width)
 
 
 def _check(path: Path, arrays: dict[str, Array], ends: NDArray[np.int64]) -> None:
-    whole = len(ends) > 0 and ends[0] > 0 and bool((np.diff(ends) > 0).all())
-    if ends.ndim != 1 or ends.dtype.kind not in "iu" or not whole:
+    if not (len(ends) > 0 and ends[0] > 0 and bool((np.diff(ends) > 0).all())):
         raise SourceError(f"demonstrations '{path}': meta/episode_ends must rise from above 0")
     for name, value in arrays.items():
-        shape = (int(ends[-1]), LAYOUT[name][0])
-        if value.shape != shape:
-            raise SourceError(f"demonstrations '{path}': data/{name} has shape {value.shape}, valid: {shape}")
-        if not np.isfinite(value).all():
-            raise SourceError(f"demonstrations '{path}': data/{name} holds a number that is not finite")
-
-
-def _zarr() -> Any:
-    try:
-        import zarr
-        import zarr.storage
-    except ImportError as error:
-        raise SourceError(missing_extra("a file of demonstrations", "diffusion", error)) from error
-    return zarr
+        where = f"demonstrations '{path}': data/{name}"
+        if len(value) != ends[-1]:
+            valid = f"{ends[-1]}, the last of meta/episode_ends"
+            raise SourceError(f"{where} has {len(value)} rows, valid: {valid}")
+        if not (np.abs(value) <= LARGEST).all():  # so written that NaN is refused
+            raise SourceError(f"{where} holds a number that is not finite or beyond {LARGEST:g}")
+    x, y = arrays["door_state"][:, 3:6], arrays["door_state"][:, 6:9]
+    if not (np.linalg.norm(np.cross(x, y), axis=-1) > LEAST_AREA).all():
+        where = f"demonstrations '{path}': columns 3 to 8 of data/door_state"
+        raise SourceError(f"{where} are no rotation, valid: its first two rows")

@@ -14,7 +14,6 @@ from wbc_bench.errors import SourceError
 from wbc_bench.rotations import matrix_from_rotvec
 from wbc_bench.sources.diffusion import poses
 from wbc_bench.sources.diffusion.demonstrations import (
-    GRIPPER_WIDTH,
     Demonstration,
     door_state,
     read_demonstrations,
@@ -37,6 +36,8 @@ RATE = 1e-3  # of AdamW, down to zero along a cosine
 DECAY = 0.999  # of the running mean of the weights that is kept. Source: Chi et al. 2023 keep one, too
 COPIES = 3  # of every window, each with the hand displaced
 SHIFT, TURN = 0.01, 0.05  # [m], [rad] standard deviations of the displacement
+SHORTEST = 1e-3  # [s] between recorded steps
+DETUNED = 0.01  # of the period: a camera of 59.94 Hz is one of 60 Hz
 LEAST = 1e-2  # half a range that a number must have to be scaled by it: what is constant stays so
 
 
@@ -53,8 +54,10 @@ def windows(episodes: list[Demonstration], period: float, rng: np.random.Generat
     In a copy the hand is a little elsewhere than it was, and everything is seen from there: so the policy
     learns the way back to the demonstration, which its own errors will make it need.
     Source: Ke et al. 2021 (Grasping with chopsticks), noise injection; Laskey et al. 2017 (DART).
+
+    Raises: SourceError, see `stride_of`.
     """
-    stride = round(PERIOD / period)
+    stride = stride_of(period)
     looks, chunks = [], []
     for episode in episodes:
         ee, target = poses.tool(episode.ee), poses.tool(episode.target)
@@ -75,14 +78,28 @@ def windows(episodes: list[Demonstration], period: float, rng: np.random.Generat
                 door = door_state(
                     Pose(episode.panel.pos[k], episode.panel.rot[k]), episode.angle[k], poses.hand(hand)
                 )
-                width = np.full((count, 1), GRIPPER_WIDTH)
+                width = episode.widths[k, :1]
                 views += [poses.numbers(poses.relative(hand, here)), width, door]
             looks.append(np.concatenate(views, axis=-1))
             base = Pose(here.pos[:, None], here.rot[:, None])
             action = poses.numbers(poses.relative(Pose(target.pos[ahead], target.rot[ahead]), base))
-            width = np.full((count, HORIZON, 1), GRIPPER_WIDTH)
+            width = episode.widths[ahead, 1:]
             chunks.append(np.concatenate([action, width], axis=-1).reshape(count, -1))
     return Windows(*(torch.from_numpy(np.concatenate(part)).float() for part in (looks, chunks)))
+
+
+def stride_of(period: Any) -> int:
+    """Steps recorded every `period` [s] from one pose of a chunk to the next.
+
+    Raises: SourceError, the period of the policy is no multiple of it.
+    """
+    if isinstance(period, int | float) and SHORTEST <= period <= PERIOD * (1 + DETUNED):
+        stride = round(PERIOD / period)
+        if abs(stride * period - PERIOD) <= DETUNED * PERIOD:
+            return stride
+    found = "is missing" if period is None else f"is {period}"
+    valid = f"{PERIOD:g} s or a whole part of it within {DETUNED:.0%}, from {SHORTEST:g} s on"
+    raise SourceError(f"control_period {found}, valid: {valid}")
 
 
 def fit(
@@ -138,11 +155,11 @@ def train(
     Raises: SourceError, the file cannot be used or does not say how often it was recorded.
     """
     found = read_demonstrations(path)
-    period = found.attributes.get("control_period")
-    if not isinstance(period, float) or not 0 < period <= PERIOD:
-        raise SourceError(
-            f"demonstrations '{path}': attribute control_period is {period}, valid: 0 to {PERIOD:g} s"
-        )
+    period: Any = found.attributes.get("control_period")
+    try:
+        stride_of(period)
+    except SourceError as error:
+        raise SourceError(f"demonstrations '{path}': attribute {error}") from error
     data = windows(found.episodes, period, np.random.default_rng(seed))
     policy = fit(data, seed, updates, report=report)
     commit = provenance.commit()
