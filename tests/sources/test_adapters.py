@@ -145,3 +145,8 @@ def test_what_is_wrong_is_named() -> None:
         umi_on_legs({"traj": [frame]})
     with pytest.raises(SourceError, match=r"\$\.traj"):
         umi_on_legs({"traj": []})
+    standing = [{"tick": tick, "eef_pose": [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]} for tick in (7, 7)]
+    with pytest.raises(SourceError, match=r"tick 7 does not rise - at `\$\.traj\[1\]\.tick`"):
+        umi_on_legs({"traj": standing})
+    with pytest.raises(SourceError, match=r"\$\.traj\[0\]\.tick"):
+        umi_on_legs({"traj": [standing[0] | {"tick": 1 << 32}]})
