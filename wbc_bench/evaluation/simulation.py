@@ -1,5 +1,6 @@
 """A shard of episodes on MuJoCo's batch API: reset from manifest rows, push, step, and measure."""
 
+import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -101,6 +102,7 @@ class Simulation:
         self._subtree_com = batch.bind("subtree_com")
         self._torque, self._sensor = batch.bind("actuator_force"), batch.bind("sensordata")
         self._places = places_of(model)
+        self.physics_time = 0.0  # [s] of processor time in the engine's steps
         self._reset()
 
     def _randomise(self, model: mujoco.MjModel) -> None:
@@ -167,7 +169,9 @@ class Simulation:
         for begin, end in pairwise(sorted({0, decimation} | self._commands.offsets | sampled)):
             self._ctrl[ids] = (self._commands.acting(begin) - self.rows.joint_offset)[ids]
             stage = _STAGE_VEL if end in sampled | {decimation} else _STAGE_NONE
+            start = time.process_time()
             self._batch.step(chosen, nstep=end - begin, stage=stage)
+            self.physics_time += time.process_time() - start
             if end in sampled:
                 for states in late:
                     states.sample(end, self.state())
