@@ -1,11 +1,13 @@
 """Messages, the clutch, silence and abuse of the stream; most of it with clocks of the test's own."""
 
+import itertools
 import math
 import pickle
 import re
 import socket as sockets
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +22,7 @@ from stream_wire import HAND, PERIOD, QUICK, SEEN, offset, wire
 from wbc_bench import sources
 from wbc_bench.errors import SourceError
 from wbc_bench.rotations import geodesic_angle, matrix_from_rpy, matrix_from_wxyz
-from wbc_bench.sources import StampedTarget, to_world
+from wbc_bench.sources import StampedTarget, load_source, replayed_stream, to_world
 from wbc_bench.sources.latency import stream_latency
 from wbc_bench.sources.message import MAX_BYTES, MessageStatus
 from wbc_bench.sources.slew import Limits
@@ -441,6 +443,25 @@ def test_what_waits_to_be_read_is_bounded(stream: StreamSource) -> None:
     """In transmissions a client, and in bytes a transmission: 1 MiB."""
     most = stream._socket.getsockopt(zmq.RCVHWM) * stream._socket.getsockopt(zmq.MAXMSGSIZE)  # pyright: ignore[reportOperatorIssue]
     assert 0 < most <= 1 << 20 and stream._socket.getsockopt(zmq.MAXMSGSIZE) >= MAX_BYTES  # pyright: ignore[reportOperatorIssue]
+
+
+def test_a_replayed_stream_that_nobody_reads_goes_on_and_can_be_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its client fills every buffer on the way, drops what finds no room, and ends when it is told to."""
+    sent, filled = itertools.count(), threading.Event()
+
+    def encoded(*_) -> bytes:
+        if next(sent) == 8000:  # 32 MB; some 8 MB find room
+            filled.set()
+        return bytes(4000)
+
+    monkeypatch.setattr(replayed_stream, "RATE", 1e9)
+    monkeypatch.setattr(replayed_stream, "encode", encoded)
+    source = load_source("stream:figure_eight", "tcp://127.0.0.1:*")
+    source.reset(SEEN)
+    assert filled.wait(60.0)
+    source.close()
 
 
 # documents and numbers

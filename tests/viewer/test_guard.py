@@ -35,6 +35,7 @@ def test_the_token_opens_the_page_and_a_cookie_keeps_it_open(served: Served) -> 
         ({}, "token"),
         ({"Cookie": "wbc_bench_80=x"}, "token"),
         ({"Host": "evil.example"}, "host 'evil.example'"),
+        ({"Host": "[::1"}, "host '[::1'"),
         ({"Host": "localhost.evil.example:80"}, "is not the address of this page"),
         ({"Origin": "http://evil.example"}, "origin 'http://evil.example'"),
         ({"Origin": "null"}, "origin 'null'"),

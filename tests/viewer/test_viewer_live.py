@@ -216,6 +216,10 @@ def test_what_a_page_sends_is_checked_against_what_it_offers(served: Served, tmp
     view.gizmo.position = (float("nan"), 0.0, 0.0)
     view.ask(view._goal_moved)
     says("no pose within 10 m")
+    view.gizmo._impl.position = np.zeros(2)  # as a crafted message writes it
+    view.ask(lambda: None)
+    view.ask(view._goal_moved)
+    wait_for(lambda: len(view.gizmo.position) == 3, 20, "it is at the hand again")
     view.ask(lambda: panel._push("up"))
     says("unknown choice 'up'")
     before = session.moment.time

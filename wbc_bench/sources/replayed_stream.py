@@ -1,5 +1,6 @@
 """A script sent over the stream: `--source stream:SCRIPT` goes through the socket without a person."""
 
+import contextlib
 import secrets
 import threading
 import time as clocks
@@ -62,7 +63,8 @@ class ReplayedStream:
         session, sequence, start = secrets.randbits(63), 0, clocks.monotonic()
         while not self._done.wait(1 / RATE):
             target = self._script.target(clocks.monotonic() - start, seen)
-            socket.send(encode(target._replace(time=clocks.time()), session, sequence))
+            with contextlib.suppress(zmq.Again):  # nobody reads: waiting for room would never end
+                socket.send(encode(target._replace(time=clocks.time()), session, sequence), zmq.NOBLOCK)
             sequence += 1
         socket.close()
         context.term()

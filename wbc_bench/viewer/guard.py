@@ -37,7 +37,10 @@ class Guard:
     def refusal(self, path: str, headers: Any) -> str:
         """Why a request is refused; empty when it is not."""
         host = headers.get("Host", "")
-        name = urlsplit(f"//{host}").hostname or ""
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:  # no address at all
+            name = ""
         if not self._is_here(name):
             return f"host '{host}' is not the address of this page"
         origin = headers.get("Origin")

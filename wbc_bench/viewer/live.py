@@ -34,11 +34,9 @@ class LiveView:
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.paused, self.waiting, self.speed = False, False, 1.0
         self.scene = SceneView(server, session.robot, session.protocol.success, TRAIL_PIECES)
-        self.gizmo = server.scene.add_transform_controls(
-            "/goal", scale=GIZMO, line_width=4.0, depth_test=False
-        )
+        self._server = server
+        self._place_gizmo()
         self.panel = Panel(server, self)
-        self.gizmo.on_update(lambda _: self.ask(self._goal_moved))
         self._pace: deque[tuple[float, float]] = deque(maxlen=100)  # (wall, simulated) [s]
         self._drawn: Moment | None = None
         self._surroundings: Scene | None = None
@@ -153,6 +151,15 @@ class LiveView:
             raise BenchError(f"speed {speed:g}, valid: {low:g} to {high:g}")
         self.speed = speed
 
+    def _place_gizmo(self) -> None:
+        """A gizmo at the hand; a new one, since one whose pose is no pose cannot be told another."""
+        pos_w, wxyz = hand_pose(self.session.moment)
+        self.gizmo = self._server.scene.add_transform_controls(
+            "/goal", scale=GIZMO, line_width=4.0, depth_test=False, position=pos_w, wxyz=wxyz
+        )
+        self.gizmo.visible = self.session.dragged
+        self.gizmo.on_update(lambda _: self.ask(self._goal_moved))
+
     def _goal_moved(self) -> None:
         try:
             pos_w, wxyz = np.array(self.gizmo.position, float), np.array(self.gizmo.wxyz, float)
@@ -161,7 +168,7 @@ class LiveView:
         except (TypeError, ValueError):
             pos_w, turned, sound = np.zeros(3), np.zeros(4), False
         if not sound or not (np.abs(pos_w) <= FARTHEST).all():  # not so of NaN either
-            self.gizmo.position, self.gizmo.wxyz = hand_pose(self.session.moment)
+            self._place_gizmo()
             raise BenchError(f"a goal that is no pose within {FARTHEST:g} m")
         self.session.set_goal(pos_w, turned)
         if self.waiting:
