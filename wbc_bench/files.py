@@ -6,7 +6,9 @@ import hashlib
 import os
 import re
 import shutil
+import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from wbc_bench.errors import StoreError
@@ -44,7 +46,10 @@ def is_folder_name(name: str) -> bool:
 
 
 STALE = 3600.0  # [s] what a temporary file is written in is a minute at most
-_TEMPORARY = re.compile(r"\.?\.probe-\d+(\.\d+\.tmp)?|\.publish-\w+")
+_PROBE = re.compile(r"\.probe-\d+|\.\.probe-(\d+)\.\1\.tmp")
+_PROBED = b"probe"
+_SCRATCH = ".publish-"
+_MARK, _MARKED = ".wbc-bench", b"temporary folder of wbc-bench; it may be removed\n"
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -82,20 +87,55 @@ def ensure_writable(folder: Path) -> None:
     _sweep(folder)
     probe = folder / f".probe-{os.getpid()}"
     try:
-        write_atomic(probe, b"probe")
+        write_atomic(probe, _PROBED)
     finally:
         probe.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def scratch_folder(parent: Path) -> Iterator[Path]:
+    """An empty folder below `parent`, on the same file system, that is removed in the end.
+
+    What a killed process left there of this package's temporary files is removed first.
+
+    Raises: OSError when it cannot be made.
+    """
+    _sweep(parent)
+    with tempfile.TemporaryDirectory(prefix=_SCRATCH, dir=parent) as folder:
+        Path(folder, _MARK).write_bytes(_MARKED)
+        inner = Path(folder, "made")
+        inner.mkdir()
+        yield inner
+
+
 def _sweep(folder: Path) -> None:
-    """Remove temporary files and folders of this package that nobody has touched for STALE seconds."""
-    with contextlib.suppress(OSError):  # whoever else sweeps, or a folder of somebody else's
-        for path in folder.iterdir():
-            if _TEMPORARY.fullmatch(path.name) and time.time() - path.lstat().st_mtime > STALE:
-                if path.is_dir() and not path.is_symlink():
+    """Remove temporary files and folders of this package that nobody has touched for STALE seconds.
+
+    The folder may be any of the user's, whose files may have such names too: the content decides.
+    """
+    paths = []
+    with contextlib.suppress(OSError):  # a folder that cannot be listed
+        paths = list(folder.iterdir())
+    for path in paths:
+        with contextlib.suppress(OSError):  # whoever else sweeps, or a file of somebody else's
+            if _is_ours(path) and time.time() - path.lstat().st_mtime > STALE:
+                if path.is_dir():
                     shutil.rmtree(path, ignore_errors=True)
                 else:
                     path.unlink(missing_ok=True)
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether this package made a temporary file or folder; of anything in doubt it did not."""
+    if path.is_symlink():
+        return False
+    if _PROBE.fullmatch(path.name):
+        return (
+            path.is_file() and path.stat().st_size <= len(_PROBED) and _PROBED.startswith(path.read_bytes())
+        )
+    mark = path / _MARK
+    marked = path.name.startswith(_SCRATCH) and path.is_dir() and mark.is_file()
+    return marked and mark.stat().st_size == len(_MARKED) and mark.read_bytes() == _MARKED
 
 
 def _sync_folder(folder: Path) -> None:

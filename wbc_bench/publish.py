@@ -1,6 +1,5 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +9,7 @@ import pandas as pd
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import ReachTargets, protocol_names, read_protocol
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.files import PROTOCOLS
+from wbc_bench.files import PROTOCOLS, scratch_folder
 from wbc_bench.results import report
 from wbc_bench.results.analysis import Evaluated, collect_all
 from wbc_bench.results.doors import DoorRun, door_table, read_doors
@@ -64,8 +63,7 @@ def publish(
     colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".publish-", dir=out) as folder:
-            made = Path(folder)
+        with scratch_folder(out) as made:
             for protocol, methods in evaluated.items():
                 _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
             _write_tracks(tracks, made, labels, colours)

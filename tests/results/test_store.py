@@ -4,7 +4,9 @@ import errno
 import hashlib
 import os
 import shutil
+import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -17,7 +19,7 @@ import pytest
 
 from synthetic import FakeRun, episodes, record
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.files import STALE, ensure_writable, folder_name, write_atomic
+from wbc_bench.files import STALE, ensure_writable, folder_name, scratch_folder, write_atomic
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
 from wbc_bench.results.analysis import collect
@@ -265,24 +267,52 @@ def test_a_really_full_disk(tmp_path):
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
-    """Only names of this package, only old ones; a link's target is nobody's business."""
+KILLED = {  # what a process does that is killed in the midst of it
+    "probe": "wbc_bench.files.Path.unlink = kill; ensure_writable(here)",
+    "half a probe": "wbc_bench.files.Path.replace = kill; ensure_writable(here)",
+    "publication": "with scratch_folder(here) as made: (made / 'report.html').write_text(''); kill()",
+}
+
+
+@pytest.mark.parametrize("what", KILLED)
+def test_what_a_killed_process_left_is_removed_by_a_later_one(tmp_path, what):
+    code = (
+        "import os, signal, sys, wbc_bench.files\n"
+        "from wbc_bench.files import Path, ensure_writable, scratch_folder\n"
+        "kill = lambda *_, **__: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"here = Path(sys.argv[1])\n{KILLED[what]}\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)])
+    (left,) = tmp_path.iterdir()
+    assert done.returncode == -signal.SIGKILL and left.name.startswith((".probe-", "..probe-", ".publish-"))
+    ensure_writable(tmp_path)
+    assert left.exists()  # its process could still be at it
     old = time.time() - 2 * STALE
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    (kept / "file").write_text("mine")
-    for name in (".probe-12", "..probe-12.12.tmp", ".probes", ".probe-x", "probe-12", ".publish", "data.tmp"):
-        (tmp_path / name).write_text("")
-    (tmp_path / ".publish-abc123").mkdir()
-    (tmp_path / ".publish-abc123" / "table.csv").write_text("")
-    (tmp_path / ".publish-link").symlink_to(kept, target_is_directory=True)
+    os.utime(left, (old, old))
+    ensure_writable(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_old_files_of_the_user_with_such_names_stay(tmp_path):
+    """Any folder may be written to, the working directory among them."""
+    for name in (".probes", ".probe-x", "probe-12", ".publish", "data.tmp", ".probe-2024", "..probe-1.2.tmp"):
+        (tmp_path / name).write_text("" if name == "..probe-1.2.tmp" else "mine")
+    for name in (".publish-site", ".publish-ab12cd34", ".publish-marked", "kept"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "report.html").write_text("mine")
+    (tmp_path / ".publish-marked" / ".wbc-bench").write_text("mine")
+    (tmp_path / ".publish-link").symlink_to(tmp_path / "kept", target_is_directory=True)
+    (tmp_path / ".probe-7").symlink_to(tmp_path / "kept" / "report.html")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    names = {path.name for path in tmp_path.iterdir()}
+    old = time.time() - 2 * STALE
     for path in tmp_path.iterdir():
         os.utime(path, (old, old), follow_symlinks=False)
-    (tmp_path / ".publish-now").mkdir()
     ensure_writable(tmp_path)
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {".probes", ".probe-x", "probe-12", ".publish", "data.tmp", ".publish-now", "kept"}
-    assert (kept / "file").read_text() == "mine"
+    with scratch_folder(tmp_path):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == names
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_ensure_writable_refuses_what_cannot_be_written(tmp_path):
