@@ -1,5 +1,6 @@
 """A controller's code neither disturbs others nor is disturbed: arrays, global random streams, faults."""
 
+import os
 import random
 import subprocess
 import sys
@@ -173,7 +174,22 @@ def test_any_exception_comes_back_as_the_user_s_own_frames(tmp_path: Path, kind:
 
 def test_an_interrupt_raised_by_a_controller_is_its_fault_in_a_worker(tmp_path: Path) -> None:
     spec = controller(tmp_path, "interrupts", "def more(self, obs, target):\n    raise KeyboardInterrupt")
-    with pytest.raises(ControllerError, match=r"interrupts.py:Mine' raised KeyboardInterrupt"):
+    place = "'mine' failed in `act` at control step 0 of episodes 0 to 5: KeyboardInterrupt"
+    with pytest.raises(ControllerError, match=rf"{place}: .*interrupts.py:\d+ in more"):
+        rows(spec, write_tiny(tmp_path), workers=2)
+    with pytest.raises(KeyboardInterrupt):  # in the user's own process it may be the user's
+        rows(spec, write_tiny(tmp_path), workers=1)
+
+
+def test_an_interrupt_raised_by_a_factory_is_its_fault_in_a_worker(tmp_path: Path) -> None:
+    body = f"""
+def __init__(self, robot):
+    self.q = robot.default_q
+    if __import__("os").getpid() != {os.getpid()}:
+        raise KeyboardInterrupt
+"""
+    spec = controller(tmp_path, "unmade_apart", body)
+    with pytest.raises(ControllerError, match=r"unmade_apart.py:Mine' raised KeyboardInterrupt"):
         rows(spec, write_tiny(tmp_path), workers=2)
 
 

@@ -135,14 +135,18 @@ class ControlLoop:
         try:
             with self._randomness.own():
                 yield
-        except (BenchError, KeyboardInterrupt):
+        except BenchError:
             raise
         except BaseException as error:
             episodes = self._rows.episode
-            raise ControllerError(
+            said = (
                 f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "
                 f"of episodes {episodes.min()} to {episodes.max()}: {fault_of(error)}"
-            ) from error
+            )
+            if isinstance(error, KeyboardInterrupt):  # of the user, or of the controller: a worker knows
+                error.add_note(said)
+                raise
+            raise ControllerError(said) from error
 
     def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_]) -> None:
         pushed = self._push_step == self.step

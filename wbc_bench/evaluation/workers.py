@@ -89,10 +89,9 @@ def _work_apart(task: Task) -> Result:
     try:
         return _work(task)
     except KeyboardInterrupt as error:  # interrupts are the client's: this one was raised by somebody's code
-        raise ControllerError(
-            f"controller '{task.controller if isinstance(task.controller, str) else 'handed over'}' raised "
-            f"{fault_of(error)}"
-        ) from None
+        name = task.controller if isinstance(task.controller, str) else "handed over"
+        said = getattr(error, "__notes__", None) or [f"controller '{name}' raised {fault_of(error)}"]
+        raise ControllerError(said[-1]) from None
 
 
 def results(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
