@@ -271,6 +271,18 @@ def test_a_real_episode(smoke: EvalProtocol, tmp_path, calm_rows: CalmRows):
     assert a.steps.min() > 5 and np.array_equal(a.action, b.action, equal_nan=True)
 
 
+def test_the_shard_defines_an_episode():
+    """Its bits are those of the same shard; alone an episode only begins alike, contacts amplify rounding."""
+    protocol, path = find_protocol("smoke_v1")
+    rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 4)
+    a, b = (rollout(load_controller("learned:transformer_gru@0", load_robot()), protocol, rows) for _ in "ab")
+    np.testing.assert_array_equal(a.ee_pos_w, b.ee_pos_w)
+    for row in range(len(rows)):
+        controller = load_controller("learned:transformer_gru@0", load_robot())
+        alone = rollout(controller, protocol, rows.take(slice(row, row + 1)))
+        np.testing.assert_allclose(alone.action[0, 0], a.action[row, 0], atol=1e-5)
+
+
 def test_conditions_other_than_the_training_s_are_listed():
     protocol, _ = find_protocol("ablation_v1")
     card = new_card("no_latent", 0, 0, 0.0, protocol)
