@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from tiny_protocol import write_tiny
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.errors import ControllerError
 from wbc_bench.evaluation.evaluate import evaluate
+from wbc_bench.evaluation.latents import sample_latents
 from wbc_bench.isolation import GlobalRandomness
+from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 
 HEAD = """
@@ -197,3 +201,29 @@ def test_a_factory_that_fails_is_one_line(tmp_path: Path) -> None:
     spec = controller(tmp_path, "unmade", "def __init__(self, robot):\n    raise OSError('no such weights')")
     with pytest.raises(ControllerError, match=r"cannot be made: OSError: no such weights \(unmade.py:\d+ in"):
         rows(spec, write_tiny(tmp_path))
+
+
+def test_a_digest_that_fails_is_one_line(tmp_path: Path) -> None:
+    spec = controller(tmp_path, "undigested", "def digest(self):\n    raise SystemExit('no such variable')")
+    said = r"'Mine' failed in `digest`: SystemExit: no such variable \(undigested.py:\d+ in digest\)"
+    with pytest.raises(ControllerError, match=said):
+        rows(spec, write_tiny(tmp_path))
+
+
+def test_a_latent_that_fails_is_one_line_and_draws_from_streams_of_its_own(tmp_path: Path) -> None:
+    body = """
+steps = 0
+
+def latent(self):
+    self.steps += 1
+    if self.steps == 3:
+        raise LookupError("none yet")
+    return np.full((6, 2), random.random())
+"""
+    protocol, path = find_protocol(str(write_tiny(tmp_path)))
+    manifest, _ = read_manifest(protocol, manifest_path(path))
+    mine = load_controller(controller(tmp_path, "shown", body), load_robot(protocol.robot))
+    outside = random.getstate()
+    with pytest.raises(ControllerError, match=r"in `latent` at control step 3 .*: none yet \(shown"):
+        sample_latents(mine, protocol, manifest.of_replicate(0, 6))
+    assert random.getstate() == outside

@@ -18,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from wbc_bench.errors import ControllerError
+from wbc_bench.errors import BenchError, ControllerError, fault_of
 
 PACKAGE = Path(__file__).parent
 ROOT = "wbc_bench.evaluation.shard"  # what computes an episode, with all that it imports
@@ -114,7 +114,7 @@ def software(controller: object) -> Software:
     inside a function, with the files in `info.files`, with the controllers that are its attributes, and with
     what its method `digest()` returns, for state that no file holds, e.g. an environment variable.
 
-    Raises: ControllerError, a declared file cannot be read.
+    Raises: ControllerError, a declared file cannot be read or `digest()` fails.
     """
     digest = hashlib.sha256(str(getattr(controller, "checkpoint_sha256", None)).encode())
     for path in sources(type(controller).__module__):
@@ -131,7 +131,13 @@ def software(controller: object) -> Software:
             _add(digest, "part", software(part).controller.encode())
     own = getattr(controller, "digest", None)
     if callable(own):
-        _add(digest, "digest()", str(own()).encode())
+        try:
+            _add(digest, "digest()", str(own()).encode())
+        except (BenchError, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            name = type(controller).__name__
+            raise ControllerError(f"controller '{name}' failed in `digest`: {fault_of(error)}") from error
     return Software(_harness(), digest.hexdigest())
 
 

@@ -72,7 +72,7 @@ class ControlLoop:
             for delay in (rows.observation_delay, rows.odometry_delay)
         ]
         if isinstance(controller, ProtocolAware):
-            with self._blamed("prepare"):
+            with self.blamed("prepare"):
                 controller.prepare(protocol)
         self._see()
 
@@ -97,9 +97,9 @@ class ControlLoop:
         """Tell the controller what it begins with."""
         controller = self._controller
         if isinstance(controller, UsesRandomness):
-            with self._blamed("seed"):
+            with self.blamed("seed"):
                 controller.seed(stream(int(self._rows.noise_key[0]), "controller"))
-        with self._blamed("reset"):
+        with self.blamed("reset"):
             controller.reset(self._rows.episode.copy(), self.observation, target)
 
     def advance(self, target: Target) -> StepResult:
@@ -108,7 +108,7 @@ class ControlLoop:
         Raises: ControllerError when the controller fails, or its command has the wrong type or shape.
         """
         active = self.active
-        with self._blamed("act"):
+        with self.blamed("act"):
             command = self._controller.act(self.observation, target)
         if not isinstance(command, JointCommand):
             raise ControllerError(
@@ -130,8 +130,11 @@ class ControlLoop:
         return result
 
     @contextmanager
-    def _blamed(self, method: str) -> Iterator[None]:
-        """What a controller raises, `SystemExit` too, in one line: its own frames, step and episodes."""
+    def blamed(self, method: str) -> Iterator[None]:
+        """Where the controller's code runs: global random streams are its own, its faults one line.
+
+        What it raises, `SystemExit` too, comes back with its own frames, step and episodes.
+        """
         try:
             with self._randomness.own():
                 yield

@@ -13,7 +13,7 @@ from wbc_bench.results.latents import Samples
 def sample_latents(controller: Controller, protocol: EvalProtocol, rows: EpisodeManifest) -> Samples:
     """The latent of every control step of some episodes, and the position error that it was inferred at.
 
-    Raises: ControllerError, the controller shows no latent or one of the wrong shape.
+    Raises: ControllerError, the controller shows no latent, one of the wrong shape, or fails in it.
     """
     if not isinstance(controller, HasLatent):
         raise ControllerError(
@@ -24,7 +24,8 @@ def sample_latents(controller: Controller, protocol: EvalProtocol, rows: Episode
     before = loop.state
     for step, (stepped, *_) in enumerate(loop.run()):
         error = np.linalg.norm(before.ee_pos_w - rows.target_pos_w, axis=1)  # (N,) [m]
-        latent = np.asarray(controller.latent(), dtype=np.float64)
+        with loop.blamed("latent"):
+            latent = np.asarray(controller.latent(), dtype=np.float64)
         if latent.ndim != 2 or len(latent) != len(rows):
             raise ControllerError(
                 f"controller '{controller.info.name}' shows a latent of shape {latent.shape}, "
