@@ -23,7 +23,7 @@ def work(item):
     (Path(sys.argv[1]) / str(number := int(item[0]))).touch()
     time.sleep(600.0 * (number > 0))
 
-list(in_parallel(2, work, [np.full(1_000_000, k) for k in range(3)]))
+list(in_parallel(int(sys.argv[2]), work, [np.full(1_000_000, k) for k in range(3)]))
 """
 
 
@@ -41,11 +41,13 @@ def test_a_dead_worker_is_one_line():
     assert isinstance(caught.value, BenchError)
 
 
-def test_nothing_outlives_a_killed_process(tmp_path):
-    """Neither processes nor shared memory, whatever command shares out the work."""
-    process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(tmp_path)], start_new_session=True)
+@pytest.mark.parametrize("workers", [2, 4])
+def test_nothing_outlives_a_killed_process(tmp_path, workers):
+    """Neither processes, with or without an item, nor shared memory, whatever command shares out the work."""
+    command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(workers)]
+    process = subprocess.Popen(command, start_new_session=True)
     try:
-        wait_until(lambda: len(list(tmp_path.iterdir())) == 3)  # both workers are busy
+        wait_until(lambda: len(list(tmp_path.iterdir())) == 3)  # two workers are busy, others have no item
         process.kill()
         process.wait()
         wait_until(lambda: not group_exists(process.pid))

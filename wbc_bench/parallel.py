@@ -5,7 +5,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from functools import cache
 from typing import Any, TypeVar
 
 from wbc_bench.errors import BenchError
@@ -43,22 +42,17 @@ def _in_processes(
 
     # max_nbytes: items are small, and a temporary folder of memory maps would outlive a kill
     options: Any = {"batch_size": 1, "max_nbytes": None}
-    with parallel_config("loky", inner_max_num_threads=1):
+    # when a worker begins, not with its first item: one that was given none would wait for minutes
+    leave: Any = {"initializer": _leave_with, "initargs": (os.getpid(),)}
+    with parallel_config("loky", inner_max_num_threads=1, **leave):
         parallel = Parallel(workers, return_as="generator" if ordered else "generator_unordered", **options)
-    client = os.getpid()
     try:
-        results: Any = parallel(delayed(_work_for)(client, work, item) for item in items)
+        results: Any = parallel(delayed(work)(item) for item in items)
         yield from results
     except BrokenProcessPool as error:  # one dead worker takes the whole pool down
         raise WorkerError("a worker died: run again, with fewer --workers if memory ran out") from error
 
 
-def _work_for(client: int, work: Callable[[Item], Found], item: Item) -> Found:
-    _leave_with(client)
-    return work(item)
-
-
-@cache
 def _leave_with(client: int) -> None:
     """End this process once its parent is gone: loky's workers outlive a killed one, holding their memory.
 
