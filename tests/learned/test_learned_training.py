@@ -30,7 +30,7 @@ from wbc_baselines.learned.training.backends import cpu
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
 from wbc_baselines.learned.training.campaign import campaign, is_done, runs_of, standing
 from wbc_baselines.learned.training.cli import main
-from wbc_baselines.learned.training.config import TrainingError
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.curves import curves_figure, measured_scores, smooth, write_curves
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment
 from wbc_baselines.learned.training.make import make_environment
@@ -581,6 +581,15 @@ def test_the_scores_are_means_where_their_gate_is_open():
 def test_impossible_settings_are_refused(changes, words):
     with pytest.raises(TrainingError, match=words):
         replace(TINY, **changes).check()
+
+
+@pytest.mark.parametrize(("num_envs", "updates"), [(8, 1), (16, 2), (768, 4)])
+def test_the_defaults_fit_any_number_of_environments(num_envs, updates):
+    config = TrainConfig("transformer_gru", num_envs=num_envs)
+    config.check()
+    assert config.estimator_updates == updates
+    stored = asdict(config) | {"estimator_mini_batches": updates}  # of a run that was given the number
+    assert not config.changes(stored)
 
 
 def test_mistakes_name_the_valid_values():

@@ -7,6 +7,7 @@ from typing import Literal
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
 
+ESTIMATOR_UPDATES = 4  # per iteration, where the estimator has as many environments
 FREE = frozenset({"budget", "threads"})  # settings that may differ when a run is resumed
 
 
@@ -112,9 +113,9 @@ class TrainConfig:
     estimator_share: float = 0.125
     """Fraction of the environments [1] whose rollouts train the estimator; they are drawn anew in each
     iteration."""
-    estimator_mini_batches: int = 4
+    estimator_mini_batches: int | None = None
     """Number of updates of the estimator per iteration, each on whole rollouts of a part of its
-    environments."""
+    environments; 4, or one per environment of the estimator if it has fewer, when not given."""
     estimator_learning_rate: float = 1e-3
     """Constant learning rate of the estimator [1]."""
     backend: Literal["cpu", "warp"] = "cpu"
@@ -138,7 +139,7 @@ class TrainConfig:
         """
         before = asdict(TrainConfig(self.method)) | before  # a setting newer than the run had its default
         # as they come back from a file: tuples become lists
-        old, new = (json.loads(json.dumps(settings)) for settings in (before, asdict(self)))
+        old, new = (json.loads(json.dumps(_with_updates(settings))) for settings in (before, asdict(self)))
         return {
             name: (old[name], value) for name, value in new.items() if name not in FREE and old[name] != value
         }
@@ -184,8 +185,9 @@ class TrainConfig:
             *("budget", "num_envs", "num_steps_per_env", "num_learning_epochs", "num_mini_batches"),
             *("estimator_mini_batches", "threads"),
         ):
-            if getattr(self, name) < 1:
-                raise TrainingError(f"{option(name)} {getattr(self, name)}: valid: 1 or more")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise TrainingError(f"{option(name)} {value}: valid: 1 or more")
         for name, values in (
             ("distillation_steps", (self.distillation_steps,)),
             ("std_legs", self.std_legs),
@@ -223,22 +225,39 @@ class TrainConfig:
                 f"--num-mini-batches {self.num_mini_batches}: valid: 1 to "
                 f"{self.num_envs * self.num_steps_per_env} (num-envs x num-steps-per-env)"
             )
-        if self.estimator_mini_batches > self.estimator_envs:
+        if self.estimator_updates > self.estimator_envs:
             raise TrainingError(
                 f"--estimator-mini-batches {self.estimator_mini_batches}: valid: 1 to {self.estimator_envs}, "
                 f"the environments that train the estimator (--num-envs {self.num_envs} x --estimator-share "
-                f"{self.estimator_share:g}): give --estimator-mini-batches {self.estimator_envs} or more"
+                f"{self.estimator_share:g}): give --estimator-mini-batches {self.estimator_envs} or fewer"
             )
 
     @property
     def estimator_envs(self) -> int:
         """Number of environments whose rollouts train the estimator."""
-        return max(1, round(self.num_envs * self.estimator_share))
+        return _estimator_envs(self.num_envs, self.estimator_share)
+
+    @property
+    def estimator_updates(self) -> int:
+        """Number of updates of the estimator per iteration."""
+        return _with_updates(asdict(self))["estimator_mini_batches"]
 
 
 def option(name: str) -> str:
     """Command-line option of a setting, for error messages: `--num-envs` of `num_envs`."""
     return f"--{name.replace('_', '-')}"
+
+
+def _estimator_envs(num_envs: int, share: float) -> int:
+    return max(1, round(num_envs * share))
+
+
+def _with_updates(settings: dict) -> dict:
+    """Settings in which a number of updates of the estimator that was not given is the one that is used."""
+    if settings["estimator_mini_batches"] is not None:
+        return settings
+    most = _estimator_envs(settings["num_envs"], settings["estimator_share"])
+    return settings | {"estimator_mini_batches": min(ESTIMATOR_UPDATES, most)}
 
 
 def _progress(samples: float, begin: float, end: float) -> float:

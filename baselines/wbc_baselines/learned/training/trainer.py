@@ -218,7 +218,7 @@ class Trainer:
         """
         assert self.optimizer is not None
         config, sums = self.config, {}
-        for batch in rollout.batches(config.estimator_mini_batches):
+        for batch in rollout.batches(config.estimator_updates):
             noise = torch.randn(*batch.start.shape, self.estimator.latent_dim, device=self.device)
             losses = self.estimator.losses(batch, noise)
             self.optimizer.zero_grad()
@@ -228,7 +228,7 @@ class Trainer:
             for name, value in losses.items():
                 sums[f"estimator_{name}"] = sums.get(f"estimator_{name}", 0.0) + value.detach()
         self.estimator.observe(rollout.history)
-        return {name: float(value) / config.estimator_mini_batches for name, value in sums.items()}
+        return {name: float(value) / config.estimator_updates for name, value in sums.items()}
 
     # ---- observations and context --------------------------------------------------------------------------
 
