@@ -49,5 +49,12 @@ class EpisodeBatch:
     position_error: NDArray[np.float64]  # (N, T) [m]
     orientation_error: NDArray[np.float64]  # (N, T) [rad]
     action: NDArray[np.float64]  # (N, T, 14) normalised: (command - default) / scale
+    command: NDArray[np.float64]  # (N, T, 14) [rad]
     ee_pos_w: NDArray[np.float64]  # (N, T, 3) [m] end-effector in the world
+    inside: NDArray[np.bool_]  # (N, T) both errors inside the tolerances
+    work: NDArray[np.float64]  # (N, T) [J] positive mechanical work of the motors in a control step
+    at_torque_limit: NDArray[np.bool_]  # (N, T) some joint was, within the control step
+    at_speed_limit: NDArray[np.bool_]  # (N, T)
+    slip: NDArray[np.float64]  # (N, T) [m] way of the loaded soles along the ground in a control step
+    push_step: NDArray[np.int64]  # (N, P) control steps at whose start there was a push, -1 for none
     infeasible_steps: NDArray[np.int64]  # (N,) control steps on which the controller had no solution

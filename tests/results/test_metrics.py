@@ -25,6 +25,9 @@ def batch_of(steps, total=6, window=2, **changes) -> EpisodeBatch:
         },
         **{"outcome": np.array([Outcome.MISSED] * len(steps), dtype=object), "position_error": error},
         **{"orientation_error": 2 * error, "action": action, "ee_pos_w": position},
+        **{"command": 0.5 * action, "inside": error < 2, "work": error, "slip": 0.01 * error},
+        **{"at_torque_limit": error == 1, "at_speed_limit": error < 0},
+        "push_step": np.full((len(steps), 2), -1),
     }
     return EpisodeBatch(**(values | changes))
 
@@ -107,3 +110,42 @@ def test_every_metric_is_described():
     names = [metric.name for metric in metrics.METRICS]
     assert len(set(names)) == len(names)
     assert all(metric.unit and metric.source for metric in metrics.METRICS)
+
+
+def test_commands_in_rad_and_their_rate_do_not_depend_on_the_action_scale():
+    values = metrics.compute(batch_of([3, 1]))
+    # commands are half of t^2: changes of 0.5 and 1.5 in 14 joints
+    assert values["action_variation_rad"][0] == pytest.approx(14 * (0.25 + 2.25) / 2)
+    assert values["command_rate"][0] == pytest.approx(np.sqrt((0.25 + 2.25) / 2) / PERIOD)
+    assert np.isnan(values["command_rate"][1])
+
+
+def test_time_to_reach_is_the_first_entry_that_is_held():
+    inside = np.array([[0, 1, 0, 1, 1, 0], [1, 1, 0, 0, 0, 0], [1, 0, 1, 0, 1, 0]], dtype=bool)
+    values = metrics.compute(batch_of([6, 6, 6], inside=inside))["time_to_reach"]
+    assert values[:2] == pytest.approx([4 * PERIOD, PERIOD])  # the state after the fourth step, the first
+    assert np.isnan(values[2])
+
+
+def test_energy_power_limits_and_slip_are_over_the_completed_steps():
+    values = metrics.compute(batch_of([4, 2]))
+    assert values["energy"] == pytest.approx([6.0, 1.0])  # 0 + 1 + 2 + 3; 0 + 1
+    assert values["mean_power"] == pytest.approx([6 / (4 * PERIOD), 1 / (2 * PERIOD)])
+    assert values["torque_limit_share"] == pytest.approx([1 / 4, 1 / 2])
+    assert values["speed_limit_share"] == pytest.approx([0, 0])
+    assert values["foot_slip"] == pytest.approx([0.06, 0.01])
+
+
+def test_error_after_a_push_counts_only_where_the_push_met_a_hand_at_its_target():
+    total = 200  # of which the two seconds after a push are 100
+    inside = np.zeros((4, total), dtype=bool)
+    inside[:, 9] = [True, False, True, True]
+    push = np.array([[10, -1], [10, -1], [10, 50], [-1, -1]])
+    error = np.tile(np.arange(total) * 0.001, (4, 1))
+    batch = batch_of(
+        [total, total, 60, total], total, 50, inside=inside, push_step=push, position_error=error
+    )
+    values = metrics.compute(batch)["push_error"]
+    assert values[0] == pytest.approx(0.109)  # steps 10 to 109
+    assert np.isnan(values[1]) and np.isnan(values[3])
+    assert values[2] == pytest.approx(0.059)  # the episode ended; the second push met it off target

@@ -90,9 +90,7 @@ def test_a_manifest_of_a_robot_whose_facts_changed_is_refused(monkeypatch: pytes
     protocol, path = find_protocol("smoke_v1")
     read_manifest(protocol, manifest_path(path))
     monkeypatch.setattr(Robot, "digest", "0" * 64)
-    with pytest.raises(
-        ManifestError, match=r"another|robot of digest .* facts have changed, freeze it again"
-    ):
+    with pytest.raises(ManifestError, match=r"another|robot of digest .* facts have changed, make it again"):
         read_manifest(protocol, manifest_path(path))
 
 

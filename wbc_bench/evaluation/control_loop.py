@@ -56,9 +56,9 @@ class ControlLoop:
         self._randomness = GlobalRandomness(int(rows.noise_key[0]))
         self.simulation = Simulation(protocol, rows, scene)
         self.sensors = Sensors(protocol, rows, controller.info.signals)
-        self._push_step = np.full(rows.push_time.shape, -1)
+        self.push_step = np.full(rows.push_time.shape, -1)  # (N, P) control steps, -1 for none
         planned = np.isfinite(rows.push_time)
-        self._push_step[planned] = np.round(rows.push_time[planned] / period)
+        self.push_step[planned] = np.round(rows.push_time[planned] / period)
         parts = (rows.push_vel, 2), (rows.push_vel_z, 1), (rows.push_ang_vel, 3)
         self._push_vel = np.concatenate([part.reshape(count, -1, width) for part, width in parts], axis=2)
 
@@ -152,7 +152,7 @@ class ControlLoop:
             raise ControllerError(said) from error
 
     def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_]) -> None:
-        pushed = self._push_step == self.step
+        pushed = self.push_step == self.step
         if pushed.any():
             mask = pushed[..., None] & active[:, None, None]
             self.simulation.push(np.where(mask, self._push_vel, 0.0).sum(axis=1))

@@ -9,9 +9,12 @@ from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.evaluation.control_loop import RUNNING, ControlLoop
+from wbc_bench.evaluation.simulation import State
 from wbc_bench.outcomes import EpisodeBatch, Outcome
 from wbc_bench.robot import NUM_JOINTS
 from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
+
+LOADED = 30.0  # [N] on a sole, a tenth of the robot's weight: it stands and does not just touch
 
 
 def rollout(
@@ -33,13 +36,16 @@ def rollout(
     target_rot_w = matrix_from_wxyz(rows.target_quat_w)
 
     position_error, orientation_error = np.full((2, count, num_steps), np.nan)
-    action = np.full((count, num_steps, NUM_JOINTS), np.nan)
+    action, commands = np.full((2, count, num_steps, NUM_JOINTS), np.nan)
+    work, slip = np.full((2, count, num_steps), np.nan)
+    at_torque_limit, at_speed_limit = np.zeros((2, count, num_steps), dtype=bool)
     ee_pos_w = np.full((count, num_steps, 3), np.nan)
     steps = np.zeros(count, dtype=np.int64)
     infeasible = np.zeros((count, num_steps), dtype=bool)
 
     if on_step is not None:
         on_step(loop)
+    before = loop.state
     for step, (stepped, q, stuck) in enumerate(loop.run()):
         if not stepped.any():
             break
@@ -47,6 +53,12 @@ def rollout(
             on_step(loop)
         state = loop.state
         action[stepped, step] = loop.simulation.robot.action_of(q[stepped])
+        commands[stepped, step] = q[stepped]
+        load = loop.simulation.load
+        work[stepped, step] = load.work[stepped]
+        at_torque_limit[:, step], at_speed_limit[:, step] = load.at_torque_limit, load.at_speed_limit
+        slip[stepped, step] = _slip(before, state)[stepped]
+        before = state
         if stuck is not None:
             infeasible[:, step] = stuck
         steps[stepped] += 1
@@ -65,9 +77,23 @@ def rollout(
         position_error=position_error,
         orientation_error=orientation_error,
         action=action,
+        command=commands,
         ee_pos_w=ee_pos_w,
+        inside=inside,
+        work=work,
+        at_torque_limit=at_torque_limit,
+        at_speed_limit=at_speed_limit,
+        slip=slip,
+        push_step=loop.push_step,
         infeasible_steps=(infeasible & ~np.isnan(position_error)).sum(axis=1),
     )
+
+
+def _slip(before: State, now: State) -> NDArray[np.float64]:
+    """Way (N,) [m] of the soles along the ground in a control step, of those loaded at both of its ends."""
+    loaded = (before.foot_force_w[:, :, 2] > LOADED) & (now.foot_force_w[:, :, 2] > LOADED)  # (N, 2)
+    way = np.linalg.norm((now.foot_pos_w - before.foot_pos_w)[:, :, :2], axis=2)
+    return np.where(loaded, way, 0.0).sum(axis=1)
 
 
 def _classify(

@@ -14,6 +14,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.world import PAYLOAD, world_model
 from wbc_bench.evaluation.delays import LateCommands, LateStates, physics_steps
+from wbc_bench.evaluation.motor_load import LoadMeter, MotorLoad
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, Scene, load_robot
 from wbc_bench.rotations import matrix_from_rotvec, matrix_from_wxyz, wxyz_from_matrix
 
@@ -103,6 +104,7 @@ class Simulation:
         self._torque, self._sensor = batch.bind("actuator_force"), batch.bind("sensordata")
         self._places = places_of(model)
         self.physics_time = 0.0  # [s] of processor time in the engine's steps
+        self._meter = LoadMeter(self.robot, rows.motor_strength, physics)
         self._reset()
 
     def _randomise(self, model: mujoco.MjModel) -> None:
@@ -163,15 +165,19 @@ class Simulation:
         ids = np.flatnonzero(active)
         chosen = None if len(ids) == len(active) else ids
         self._commands.give(command)
+        self._meter.begin()
         for states in late:
             states.begin_step()
         sampled = set().union(*(states.offsets for states in late)) - {decimation}
-        for begin, end in pairwise(sorted({0, decimation} | self._commands.offsets | sampled)):
+        due = self._meter.due
+        for begin, end in pairwise(sorted({0, due, decimation} | self._commands.offsets | sampled)):
             self._ctrl[ids] = (self._commands.acting(begin) - self.rows.joint_offset)[ids]
             stage = _STAGE_VEL if end in sampled | {decimation} else _STAGE_NONE
             start = time.process_time()
             self._batch.step(chosen, nstep=end - begin, stage=stage)
             self.physics_time += time.process_time() - start
+            if end == due:
+                self._meter.sample(self._torque, self._qvel[:, _JOINT_SPEEDS], active)
             if end in sampled:
                 for states in late:
                     states.sample(end, self.state())
@@ -179,6 +185,11 @@ class Simulation:
         for states in late:
             states.sample(decimation, state)
         return state
+
+    @property
+    def load(self) -> MotorLoad:
+        """What the last control step asked of the motors."""
+        return self._meter.load
 
     @property
     def qpos(self) -> Array:

@@ -117,16 +117,31 @@ def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) ->
 TEXTS = ("stratum", "condition", "orientation", "outcome")  # columns of every file of episodes
 FINITE = ("replicate", "episode", "height", "target_x", "target_y", "success")
 NUMBERS = ("position_error", "orientation_error", "action_variation", "ee_speed_rms", "ee_sparc", "duration")
+# what records before 0.1.0 do not have
+MOTION = (
+    "action_variation_rad",
+    "command_rate",
+    "time_to_reach",
+    "energy",
+    "mean_power",
+    "torque_limit_share",
+    "speed_limit_share",
+    "foot_slip",
+    "push_error",
+)
 
 
 def _episodes(run: RunLike) -> pd.DataFrame:
-    """Episodes of a run, with every column that tables and figures are made of.
+    """Episodes of a run, with every column that tables and figures are made of; NaN for those of MOTION that
+    an old record lacks.
 
     Raises: StoreError when one is missing, of another type, or contradicts the record.
     """
     episodes, record = run.episodes(), run.record
     where = f"episodes of {record.protocol}/{record.controller}/replicate_{record.replicate}"
-    for name in (*TEXTS, *FINITE, *NUMBERS):
+    for name in (*TEXTS, *FINITE, *NUMBERS, *MOTION):
+        if name in MOTION and name not in episodes:
+            episodes[name] = np.nan
         if name not in episodes:
             raise StoreError(
                 f"{where} have no column {name}, valid: {', '.join((*TEXTS, *FINITE, *NUMBERS))}"

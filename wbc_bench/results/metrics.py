@@ -23,6 +23,8 @@ SPARC_CUTOFF = (
 SPARC_THRESHOLD = 0.05  # of the peak of the spectrum
 SPARC_PADDING = 4  # the spectrum is sampled 2**4 times as finely as the window asks for
 
+AFTER_PUSH = 2.0  # [s] choice: the quiet end of the released protocols, where no second push comes
+
 
 class Metric(NamedTuple):
     """One column of the episode record."""
@@ -64,6 +66,71 @@ def action_variation(batch: EpisodeBatch) -> FloatArray:
     change = np.sum(np.diff(batch.action, axis=1) ** 2, axis=2)  # (N, T-1) [1]
     t = np.arange(1, batch.action.shape[1])
     return mean_where(change, t < batch.steps[:, None])
+
+
+def action_variation_rad(batch: EpisodeBatch) -> FloatArray:
+    """As `action_variation`, of the commands themselves: it does not depend on an action scale."""
+    change = np.sum(np.diff(batch.command, axis=1) ** 2, axis=2)  # (N, T-1) [rad^2]
+    return mean_where(change, np.arange(1, batch.command.shape[1]) < batch.steps[:, None])
+
+
+def command_rate(batch: EpisodeBatch) -> FloatArray:
+    """Root mean square over joints and steps of the rate at which commands change."""
+    return np.sqrt(action_variation_rad(batch) / batch.command.shape[2]) / batch.control_period  # [rad/s]
+
+
+def time_to_reach(batch: EpisodeBatch) -> FloatArray:
+    """When the end-effector comes inside both tolerances and stays for a window's length; NaN if never."""
+    window = batch.window
+    total = np.cumsum(np.pad(batch.inside, ((0, 0), (1, 0))), axis=1)  # steps inside before t
+    held = total[:, window:] - total[:, :-window] == window  # (N, T - window + 1), by the first step
+    first = (held.argmax(axis=1) + 1) * batch.control_period  # [s] the state after the first step counts
+    return np.where(held.any(axis=1), first, np.nan)
+
+
+def energy(batch: EpisodeBatch) -> FloatArray:
+    """Positive mechanical work of the motors: what a drive that recovers nothing takes, heat aside."""
+    total = np.where(np.isnan(batch.work), 0.0, batch.work).sum(axis=1)
+    return np.where(batch.steps > 0, total, np.nan)  # [J]
+
+
+def mean_power(batch: EpisodeBatch) -> FloatArray:
+    return energy(batch) / duration(batch)  # [W]
+
+
+def torque_limit_share(batch: EpisodeBatch) -> FloatArray:
+    return mean_where(batch.at_torque_limit.astype(np.float64), _completed(batch))
+
+
+def speed_limit_share(batch: EpisodeBatch) -> FloatArray:
+    return mean_where(batch.at_speed_limit.astype(np.float64), _completed(batch))
+
+
+def foot_slip(batch: EpisodeBatch) -> FloatArray:
+    total = np.where(np.isnan(batch.slip), 0.0, batch.slip).sum(axis=1)
+    return np.where(batch.steps > 0, total, np.nan)  # [m]
+
+
+def push_error(batch: EpisodeBatch) -> FloatArray:
+    """Largest position error after a push that met the end-effector inside the tolerances.
+
+    It is searched from the push on for AFTER_PUSH, or to the end of the episode. NaN where no push met it
+    so: on the way to the target the error says nothing of the push.
+    """
+    after = round(AFTER_PUSH / batch.control_period)
+    t = np.arange(batch.inside.shape[1])
+    start = batch.push_step[:, :, None]  # (N, P, 1)
+    met = np.take_along_axis(batch.inside, np.maximum(batch.push_step - 1, 0), axis=1)  # (N, P)
+    met &= (batch.push_step > 0) & (batch.push_step < batch.steps[:, None])
+    searched = ((t >= start) & (t < start + after) & met[..., None]).any(axis=1)  # (N, T)
+    searched &= _completed(batch)
+    largest = np.where(searched, batch.position_error, -np.inf).max(axis=1)
+    return np.where(searched.any(axis=1), largest, np.nan)  # [m]
+
+
+def _completed(batch: EpisodeBatch) -> NDArray[np.bool_]:
+    """(N, T): the control steps that an episode made."""
+    return np.arange(batch.inside.shape[1]) < batch.steps[:, None]
 
 
 def ee_speed(batch: EpisodeBatch) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -143,6 +210,23 @@ METRICS = (
     Metric("ee_sparc", "1", "higher", SPARC_PAPER, ee_sparc),
     Metric("duration", "s", "none", "steps x control period", duration),
     Metric("infeasible_steps", "1", "lower", "control steps without a solution", infeasible_steps),
+    Metric("action_variation_rad", "rad^2", "lower", "mean |q*_t - q*_(t-1)|^2", action_variation_rad),
+    Metric("command_rate", "rad/s", "lower", "root mean square of dq*/dt", command_rate),
+    Metric("time_to_reach", "s", "lower", "first entry that is held for the window", time_to_reach),
+    Metric("energy", "J", "lower", "sum of max(tau qd, 0) dt over physics steps and joints", energy),
+    Metric("mean_power", "W", "lower", "energy / duration", mean_power),
+    Metric(
+        "torque_limit_share",
+        "1",
+        "lower",
+        "control steps with a joint at its torque limit",
+        torque_limit_share,
+    ),
+    Metric(
+        "speed_limit_share", "1", "lower", "control steps with a joint at its speed limit", speed_limit_share
+    ),
+    Metric("foot_slip", "m", "lower", "way of the loaded soles along the ground", foot_slip),
+    Metric("push_error", "m", "lower", "largest position error in the 2 s after a push", push_error),
 )
 
 

@@ -226,7 +226,7 @@ def write(
 
 def _order(path: Path) -> tuple[int, str]:
     """The main table of a protocol first, then from the general to the particular."""
-    suffixes = ("_all", "_outcomes", "_strata", "_pairs")
+    suffixes = ("_all", "_outcomes", "_strata", "_pairs", "_motion")
     known = [k for k, suffix in enumerate(suffixes, 1) if path.stem.endswith(suffix)]
     particular = "_vs_" in path.stem or "_heights_" in path.stem
     return known[0] if known else len(suffixes) + 1 if particular else 0, path.stem

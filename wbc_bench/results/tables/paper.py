@@ -3,7 +3,7 @@
 The text of a cell is what a reader needs; the CSV holds the same numbers in full and one unit per column.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,9 +31,9 @@ from wbc_bench.results.table import Table
 
 
 class Column(NamedTuple):
-    """A column of the paper's Table III."""
+    """A column of a table over replicates."""
 
-    name: str  # as in a study file
+    name: str  # as in a study file, and of the CSV's columns
     header: str
     metric: str
     quantile: float | None  # None is the mean
@@ -67,13 +67,13 @@ def defined(method: Evaluated, over: Mask) -> int:
 
 
 def columns_over_replicates(
-    method: Evaluated, over: Mask, where: Mask | None = None
+    method: Evaluated, over: Mask, where: Mask | None = None, columns: Sequence[Column] = COLUMNS
 ) -> dict[str, stats.Spread]:
-    """Column name -> spread over replicates: success over `where`, errors over those of them in `over`."""
+    """Column name -> spread over replicates: success over `where`, the rest over those of them in `over`."""
     replicate = series(method.episodes, "replicate")
     where = np.ones(len(replicate), dtype=bool) if where is None else where
     result = {}
-    for column in COLUMNS:
+    for column in columns:
         chosen = where if column.name == "success" else where & over
         masks = (chosen & (replicate == record.replicate) for record in method.records)
         values = [column_value(column, subset(method.episodes, mask)) for mask in masks]

@@ -6,6 +6,7 @@ from pathlib import Path
 from wbc_bench.results.analysis import Evaluated
 from wbc_bench.results.study import Study
 from wbc_bench.results.table import Table
+from wbc_bench.results.tables.motion import motion_table
 from wbc_bench.results.tables.pairs import compare_table, pair_table
 from wbc_bench.results.tables.paper import paper_table
 from wbc_bench.results.tables.reach import height_table, reach_table
@@ -17,9 +18,10 @@ def _write(tables: Sequence[Table], out_dir: Path | str) -> list[Path]:
 
 
 def write_study_tables(study: Study, evaluated: Mapping[str, Evaluated], out_dir: Path | str) -> list[Path]:
-    """The five tables of a study (four without a pair to compare), into `out_dir`: `<results>/tables`."""
+    """The tables of a study, those that have rows, into `out_dir`: `<results>/tables`."""
     tables = [paper_table(study, evaluated), paper_table(study, evaluated, terminated=True)]
     tables += [outcome_table(study, evaluated), stratum_table(study, evaluated), pair_table(study, evaluated)]
+    tables += [motion_table(study, evaluated)]
     return _write(tables, out_dir)
 
 
