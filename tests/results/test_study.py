@@ -85,7 +85,7 @@ def test_mistakes_are_one_line_with_the_field(tmp_path, old, new, message):
 
 def test_an_unknown_study_names_the_nearest(tmp_path):
     with pytest.raises(UnknownNameError, match="did you mean ablation_v1"):
-        find_study("ablation_v2")
+        find_study("ablation_v10")
     with pytest.raises(StudyError, match="does not exist"):
         find_study(str(tmp_path / "none.toml"))
 
