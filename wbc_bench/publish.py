@@ -14,13 +14,16 @@ from wbc_bench.results import report
 from wbc_bench.results.analysis import Evaluated, collect_all
 from wbc_bench.results.doors import DoorRun, door_table, read_doors
 from wbc_bench.results.figures.reach import write_reach_figures
+from wbc_bench.results.figures.stress import write_stress_figure
 from wbc_bench.results.figures.study import write_study_figures
 from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
 from wbc_bench.results.store import ResultStore
+from wbc_bench.results.stress import read_stress
 from wbc_bench.results.study import Study, StudyError, labels_of, released_rows, released_studies, studies_of
+from wbc_bench.results.tables.stress import write_stress_tables
 from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 
@@ -53,13 +56,18 @@ def publish(
                 f"study '{study.name}' of {study.protocol}: its name is that of another protocol with runs"
             )
     tracks, doors = read_tracks(store.root), read_doors(store.root)
-    if not evaluated and not tracks and not doors:
+    ladders = read_stress(store.root, labels)
+    for name in (stress.ladder.name for stress in ladders):
+        if name in evaluated or name in {study.name for study in known_studies}:
+            raise StoreError(f"ladder '{name}' has the name of a protocol with runs or of a study: rename it")
+    if not evaluated and not tracks and not doors and not ladders:
         raise StoreError(f"no finished run under '{store.root}': nothing to make tables of")
     known = {spec for methods in evaluated.values() for spec in methods}
     for spec in beside:
         if spec not in known:
             raise UnknownNameError("evaluated controller", spec, known, "--workspace")
     specs = known | {track.record.controller for track in tracks}
+    specs |= {climb.spec for stress in ladders for climb in stress.climbs}
     colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
     with _writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -68,7 +76,11 @@ def publish(
                 _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
             _write_tracks(tracks, made, labels, colours)
             _write_doors(doors, made, labels)
-            report.write(evaluated, made, out, {study.name: study.protocol for study in known_studies})
+            for stress in ladders:
+                write_stress_tables(stress, made / "tables")
+                write_stress_figure(stress, made / "figures", colours)
+            protocol_of = {study.name: study.protocol for study in known_studies}
+            report.write(evaluated, made, out, protocol_of, [stress.ladder.name for stress in ladders])
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))

@@ -65,6 +65,7 @@ def open_records(results: Path) -> "ResultStore":
     from wbc_bench.results.store import ResultStore
 
     kinds = ("runs/*/*/*/run.json", "doors/*/*/*/run.json", "tracks/*/*/*/track.json")
+    kinds += ("stress/*/runs/*/*/*/run.json",)
     if not any(next(results.glob(kind), None) for kind in kinds):
         raise StoreError(NO_RECORDS.format(results))
     return ResultStore(results)

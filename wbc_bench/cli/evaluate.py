@@ -1,4 +1,4 @@
-"""`wbc-bench ablation`, `reach` and `eval`: controllers on the episodes of a protocol."""
+"""`wbc-bench ablation`, `reach`, `stress` and `eval`: controllers on the episodes of protocols."""
 
 import sys
 from dataclasses import dataclass, field
@@ -112,6 +112,42 @@ class Reach(_Evaluation):
         publish(store, self.out)
         study = studies_of(protocol.name)[0]
         print_table(reach_table(study, collect(store.runs(protocol.name))))
+        print(f"tables, figures and report.html are under {self.out}")
+
+
+@dataclass(frozen=True)
+class Stress(_Evaluation):
+    """Evaluate controllers while one disturbance at a time grows, and write breaking points and margins."""
+
+    controller: tuple[str, ...] = tyro.MISSING
+    """Controllers to evaluate, each a name, name:variant, module:attribute or file.py:attribute."""
+    ladder: str = "stress_v1"
+    """Name of a released ladder, or path of a .toml file: disturbances and their levels over a protocol."""
+    factors: tuple[str, ...] = ()
+    """Names of the ladder's disturbances to evaluate; all of them when not given."""
+    episodes: int | None = None
+    """Number of episodes of each level, from the first on; the ladder's when not given."""
+
+    def run(self) -> None:
+        from wbc_bench.episodes.ladder import find_ladder
+        from wbc_bench.evaluation.stress import evaluate_stress
+        from wbc_bench.evaluation.workers import Engine
+        from wbc_bench.publish import publish
+        from wbc_bench.results.store import ResultStore
+        from wbc_bench.results.stress import read_stress
+        from wbc_bench.results.study import labels_of, released_rows
+        from wbc_bench.results.tables.stress import breaking_table, margin_table
+
+        at_least_one("--workers", self.workers)
+        engine, ladder = Engine.parse(self.engine, self.workers), find_ladder(self.ladder)
+        evaluate_stress(
+            self.controller, ladder, self.out, engine, self.factors, self.episodes, self.overwrite
+        )
+        publish(ResultStore(self.out), self.out)
+        for stress in read_stress(self.out, labels_of(released_rows())):
+            if stress.ladder.name == ladder.name:
+                for table in (breaking_table(stress), margin_table(stress)):
+                    print_table(table)
         print(f"tables, figures and report.html are under {self.out}")
 
 

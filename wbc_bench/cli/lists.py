@@ -26,7 +26,7 @@ INPUTS = (
 
 @dataclass(frozen=True)
 class List:
-    """List controllers with their variants, studies, protocols, sources, metrics, benchmarks and runs."""
+    """List controllers with variants, studies, protocols, ladders, sources, metrics, benchmarks and runs."""
 
     results: Path = RESULTS
     """Folder to read the records from."""
@@ -41,7 +41,9 @@ class List:
                 print_table(table)
             return
         runs = ResultStore(self.results).runs()
-        for table in (_controllers(runs), _studies(), _protocols(), _sources(), _metrics(), _benchmarks()):
+        for table in (_controllers(runs), _studies(), _protocols(), _ladders(), _sources()):
+            print_table(table)
+        for table in (_metrics(), _benchmarks()):
             print_table(table)
         table = _runs(runs, self.results)
         if table.rows:
@@ -136,6 +138,18 @@ def _protocols() -> "Table":
         rows.append((name, size, frozen, protocol.digest[:12], protocol.description))
     header = ("Name", "Replicates x episodes", "Frozen", "Digest", "Description")
     return Table("protocols", "Protocols", header, tuple(rows))
+
+
+def _ladders() -> "Table":
+    from wbc_bench.episodes.ladder import find_ladder, ladder_names
+    from wbc_bench.results.table import Table
+
+    rows = []
+    for ladder in map(find_ladder, ladder_names()):
+        factors = ", ".join(factor.name for factor in ladder.factors)
+        rows.append((ladder.name, ladder.source.name, str(ladder.episodes), factors, ladder.description))
+    header = ("Name", "Base", "Episodes per level", "Factors", "Description")
+    return Table("ladders", "Ladders", header, tuple(rows))
 
 
 def _sources() -> "Table":

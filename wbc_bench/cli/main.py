@@ -14,7 +14,7 @@ from tyro.conf import subcommand
 
 from wbc_bench.cli.common import THREADS, run_command
 from wbc_bench.cli.doors import DemoEval, DemoRecord, DemoTrain
-from wbc_bench.cli.evaluate import Ablation, Eval, Reach
+from wbc_bench.cli.evaluate import Ablation, Eval, Reach, Stress
 from wbc_bench.cli.lists import Bench, ExportController, List
 from wbc_bench.cli.protocol import Freeze, Show, Verify
 from wbc_bench.cli.replay import Film, Replay
@@ -26,6 +26,7 @@ from wbc_bench.errors import UnknownNameError
 Command = (
     Annotated[Ablation, subcommand("ablation")]
     | Annotated[Reach, subcommand("reach")]
+    | Annotated[Stress, subcommand("stress")]
     | Annotated[Eval, subcommand("eval")]
     | Annotated[Track, subcommand("track")]
     | Annotated[Live, subcommand("live")]

@@ -268,7 +268,7 @@ def read_protocol(path: Path) -> EvalProtocol:
         ProtocolError: unreadable, an unknown key, a wrong type or an impossible range; names the field.
     """
     protocol = read_toml(path, EvalProtocol, "protocol", ProtocolError)
-    _check(protocol, path)
+    check_protocol(protocol, path)
     return protocol
 
 
@@ -306,8 +306,16 @@ def protocol_names() -> list[str]:
     return sorted(path.stem for path in PROTOCOLS.glob("*.toml"))
 
 
-def _check(protocol: EvalProtocol, path: Path) -> None:
-    """What a type cannot say: finite numbers, ranges in order, windows inside episodes."""
+def check_protocol(protocol: EvalProtocol, path: Path | str) -> None:
+    """Check what a type cannot say: finite numbers, ranges in order, windows inside episodes.
+
+    Args:
+        protocol: The protocol.
+        path: Its file, or where else it comes from.
+
+    Raises:
+        ProtocolError: A value is not valid; names the field.
+    """
 
     def refuse(problem: str, where: str) -> NoReturn:
         raise ProtocolError(f"protocol {path}: {problem} - at `$.{where}`")

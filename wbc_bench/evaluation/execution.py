@@ -24,7 +24,7 @@ from wbc_bench.provenance import Software
 from wbc_bench.registry import build_controller, spec_of_replicate
 from wbc_bench.results.run_writer import RunWriter
 from wbc_bench.results.store import ResultStore, Run, RunKey
-from wbc_bench.robot import load_robot
+from wbc_bench.robot import RobotConfig, load_robot
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,17 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, overwrite:
     """
     with ExitStack() as stack:
         runs = []
+        # (robot, object, spec) -> controller and what computes it: jobs of many protocols share one
+        built: dict[tuple[RobotConfig, bytes | None, str], tuple[Controller, Software]] = {}
         for job in jobs:
-            built: dict[str, tuple[Controller, Software]] = {}  # spec -> controller and what computes it
             for replicate in job.replicates:
                 # one controller may meet all replicates, or another one each
                 spec = job.spec if job.packed else spec_of_replicate(job.spec, replicate)
-                if spec not in built:
+                of = job.protocol.robot, job.packed, spec
+                if of not in built:
                     controller = build_controller(job.packed or spec, load_robot(job.protocol.robot))
-                    built[spec] = controller, _software(controller, job.packed)
-                runs.append(_Run(job, spec, *built[spec], replicate, store, overwrite))
+                    built[of] = controller, _software(controller, job.packed)
+                runs.append(_Run(job, spec, *built[of], replicate, store, overwrite))
                 stack.callback(runs[-1].writer.close)
         tasks = (task for number, run in enumerate(runs) for task in run.tasks(number))
         shared = {
@@ -66,8 +68,12 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, overwrite:
             **{"versions": provenance.versions(), "machine": provenance.machine()},
         }
         shared["git_commit"], shared["git_dirty"] = provenance.commit()
+        several = len({job.protocol.name for job in jobs}) > 1
+        if several:
+            _report_reused(runs)
         for run in runs:
-            run.report_reused()
+            if not several:
+                run.report_reused()
             run.finish_if_whole(shared)  # killed between the last shard and the merge
         missing: dict[str, int] = {}  # controller -> episodes
         for run in runs:
@@ -82,7 +88,8 @@ def run_jobs(jobs: Sequence[Job], store: ResultStore, engine: Engine, overwrite:
                     run.accept(result)
                     done = progress.done + len(result.episodes)
                     left.add(run.job.spec, len(result.episodes), result.started, result.cost.seconds)
-                    name = f"{run.job.spec} replicate {run.replicate}"
+                    part = f"under {run.job.protocol.name}" if several else f"replicate {run.replicate}"
+                    name = f"{run.job.spec} {part}"
                     progress.update(done, total, name, left.text())
                     run.finish_if_whole(shared)
         return [run.writer.finished for run in runs if run.writer.finished]
@@ -94,6 +101,20 @@ def _software(controller: Controller, packed: bytes | None) -> Software:
     if packed is None:
         return software
     return software._replace(controller=hashlib.sha256(software.controller.encode() + packed).hexdigest())
+
+
+def _report_reused(runs: Sequence["_Run"]) -> None:
+    """Say what is not evaluated again, in one line per controller: of many protocols there are many runs."""
+    for spec in dict.fromkeys(run.job.spec for run in runs):
+        own = [run for run in runs if run.job.spec == spec]
+        reused = sum(run.writer.finished is not None for run in own)
+        resumed = sum(run.writer.resumed > 0 for run in own)
+        others = sum(run.by_other_code for run in own)
+        if reused or resumed:
+            line = f"{spec}: {reused} of {len(own)} runs reused, {resumed} resumed"
+            if others:
+                line += f"; {others} by other code or packages than now; --overwrite evaluates them again"
+            print(line, file=sys.stderr)
 
 
 class _Run:
@@ -142,11 +163,17 @@ class _Run:
             line = f"{name}: reused, evaluated {record.created}"
             if record.requested > writer.key.requested:
                 line += f", {record.requested} episodes, of which {writer.key.requested} are asked for"
-            if record.software_sha256 != writer.key.software_sha256:
+            if self.by_other_code:
                 line += ", by other code or packages than now; --overwrite evaluates it again"
             print(line, file=sys.stderr)
         elif writer.resumed:
             print(f"{name}: resumed after {writer.resumed} of {writer.num_shards} shards", file=sys.stderr)
+
+    @property
+    def by_other_code(self) -> bool:
+        """Whether it is reused and was evaluated by other code or packages."""
+        found = self.writer.finished
+        return found is not None and found.record.software_sha256 != self._software.digest
 
     def accept(self, result: Result) -> None:
         self._started = min(self._started, result.started)

@@ -6,7 +6,7 @@ out. The same folder gives the same bytes.
 
 import base64
 import html
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,8 @@ CAPTIONS = {  # end of a figure's name -> what it shows; {window} is that of the
     "_workspace": "Targets, and where they are reached: success over bins of target positions, "
     "projected on the vertical plane and on the ground. Faint bins hold few episodes, blank ones none.",
     "_targets": "Targets of the protocol by stratum, from the side and from above.",
+    "_ladders": "Success as one disturbance at a time grows, with Wilson intervals, and the closest curve "
+    "that never rises; a cross is where half of the base's success is lost, the base stands on the left.",
     "tracking": "Error of the hand over time while its target moves.",
 }
 REACH_CAPTION = (
@@ -156,11 +158,13 @@ def write(
     results_dir: Path | str,
     beside: Path | str | None = None,
     studies: Mapping[str, str] | None = None,
+    ladders: Sequence[str] = (),
 ) -> Path:
     """Writes `<results_dir>/report.html` from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
-    will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol.
+    will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol; `ladders`
+    are names of severity ladders, whose tables and figures form a section each.
 
     Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
     """
@@ -174,7 +178,7 @@ def write(
     ]
     # A section per protocol: its files begin with its name or a study's; the longest such name owns a file.
     protocols = list(evaluated)
-    parts_of_report = [*protocols, "tracking", "doors"]
+    parts_of_report = [*protocols, *ladders, "tracking", "doors"]
     section_of = {name: of for name, of in (studies or {}).items() if of in protocols}
     section_of |= {name: name for name in parts_of_report}
 
