@@ -80,7 +80,7 @@ def publish(
                 write_stress_tables(stress, made / "tables")
                 write_stress_figure(stress, made / "figures", colours)
             protocol_of = {study.name: study.protocol for study in known_studies}
-            report.write(evaluated, made, out, protocol_of, [stress.ladder.name for stress in ladders])
+            report.write(evaluated, made, out, protocol_of, ladders)
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))

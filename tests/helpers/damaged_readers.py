@@ -29,6 +29,7 @@ from wbc_baselines.learned.training.campaign import is_done, standing
 from wbc_baselines.learned.training.curves import smooth
 from wbc_baselines.learned.training.run_folder import RunFolder, load_resume, save_resume
 from wbc_baselines.learned.training.target_set import TargetSet, read_target_set, write_target_set
+from wbc_bench.episodes import ladder
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.manifest import read_manifest
 from wbc_bench.episodes.protocol import find_protocol, read_protocol
@@ -39,10 +40,19 @@ from wbc_bench.results.doors import door_table, read_doors, write_doors
 from wbc_bench.results.report import figure_html, given_caption
 from wbc_bench.results.run_writer import RunWriter
 from wbc_bench.results.store import ResultStore, RunKey, ShardCost
+from wbc_bench.results.stress import (
+    FactorRecord,
+    LadderRecord,
+    LevelRecord,
+    keep_ladder,
+    read_stress,
+    stress_folder,
+)
 from wbc_bench.results.study import Study, load_study
 from wbc_bench.results.table import Table, read_markdown
 from wbc_bench.results.tables.reach import reach_table
 from wbc_bench.results.tables.strata import outcome_table, stratum_table
+from wbc_bench.results.tables.stress import breaking_table, curve_table
 from wbc_bench.results.tracking import Tracked, read_tracks, tracking_table, write_track
 from wbc_bench.robot import load_robot
 from wbc_bench.robot.facts import FACTS_FILE, load_facts
@@ -112,6 +122,16 @@ def read_studies(folder: Path) -> None:
         load_study(path)
 
 
+def write_ladders(folder: Path) -> None:
+    for path in ladder.FOLDER.glob("*.toml"):
+        shutil.copy(path, folder)
+
+
+def read_ladders(folder: Path) -> None:
+    for path in sorted(folder.iterdir()):
+        ladder.load_ladder(path)
+
+
 def write_scripts(folder: Path) -> None:
     for path in (PROTOCOLS / "scripts").glob("*.toml"):
         shutil.copy(path, folder)
@@ -173,6 +193,37 @@ def read_runs(folder: Path) -> None:
 
 def seal_runs(folder: Path) -> None:
     for path in folder.glob("runs/*/*/*/run.json"):
+        _reseal(path, "episodes_sha256", path.with_name("episodes.parquet"))
+
+
+def write_climbs(folder: Path) -> None:
+    import pyarrow as pa
+
+    record = LadderRecord(
+        *("mine", "ablation_v1", LevelRecord(0.0, "mine@base", "d" * 64), 6),
+        (FactorRecord("a", "A", "m", tuple(LevelRecord(v, f"mine@a@{v:g}", "d" * 64) for v in (1.0, 2.0))),),
+    )
+    root = stress_folder(folder, "mine")
+    root.mkdir(parents=True)
+    keep_ladder(root, record)
+    facts = {"controller_name": "a", "signals": ["ee_pose"], "source": "x", "checkpoint_sha256": None}
+    facts |= {"workers": 1, "engine": "loky", "wall_time_s": 1.0} | MADE
+    for name in ("mine@base", "mine@a@1", "mine@a@2"):
+        frame = episodes(0, 6, 0.9, 1)
+        writer = RunWriter(ResultStore(root), _key(name, len(frame)))
+        writer.write(0, pa.Table.from_pandas(frame, preserve_index=False), ShardCost(1.0, 2.0))
+        writer.finish(facts)
+        writer.close()
+
+
+def read_climbs(folder: Path) -> None:
+    for stress in read_stress(folder):
+        breaking_table(stress).markdown()
+        curve_table(stress).markdown()
+
+
+def seal_climbs(folder: Path) -> None:
+    for path in folder.glob("stress/*/runs/*/*/*/run.json"):
         _reseal(path, "episodes_sha256", path.with_name("episodes.parquet"))
 
 
@@ -314,6 +365,8 @@ READERS = {
     "protocol": Reader(write_protocols, read_protocols),
     "manifest": Reader(write_manifests, read_manifests, seal_manifests),
     "study": Reader(write_studies, read_studies),
+    "ladder": Reader(write_ladders, read_ladders),
+    "climb": Reader(write_climbs, read_climbs, seal_climbs),
     "script": Reader(write_scripts, read_scripts),
     "facts": Reader(write_facts, read_facts),
     "run": Reader(write_runs, read_runs, seal_runs),

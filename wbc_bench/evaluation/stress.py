@@ -51,7 +51,7 @@ def evaluate_stress(
     count = ladder.episodes if episodes is None else episodes
     if not 1 <= count <= ladder.episodes:
         raise EvaluationError(
-            f"--episodes {count}: valid: 1 to {ladder.episodes} (episodes of {ladder.name})"
+            f"--episodes {count}: valid: 1 to {ladder.episodes} (episodes per level of {ladder.name})"
         )
     chosen = ladder.only(factors)
     robot = load_robot(ladder.base.robot)

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 BOOTSTRAP_SEED = 0
 LOST = 0.5  # share of the base's success that is lost at the breaking point
 NOT_REACHED = np.inf
-ROUNDING = 1e-12  # of a success rate that is a mean of means
+ROUNDING = 1e-9  # of a number of successes that is a mean over levels
 
 
 class Interval(NamedTuple):
@@ -46,15 +46,15 @@ class Robustness(NamedTuple):
     margin: Interval  # mean area over the factors
 
 
-def isotonic(rates: FloatArray) -> FloatArray:
+def isotonic(values: FloatArray) -> FloatArray:
     """The closest sequences that never rise, in least squares, (..., L) to (..., L).
 
     fit_i is the minimum over s <= i of the maximum over t >= i of the mean of s..t.
     Source: Robertson, Wright & Dykstra 1988, Order Restricted Statistical Inference, theorem 1.4.4.
     """
-    count = rates.shape[-1]
-    total = np.concatenate([np.zeros((*rates.shape[:-1], 1)), np.cumsum(rates, axis=-1)], axis=-1)
-    fit = np.full_like(rates, np.inf)
+    count = values.shape[-1]
+    total = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
+    fit = np.full_like(values, np.inf)
     for s in range(count):
         means = (total[..., s + 1 :] - total[..., s : s + 1]) / np.arange(1, count - s + 1)  # of s..t
         largest = np.maximum.accumulate(means[..., ::-1], axis=-1)[..., ::-1]  # over t >= i
@@ -115,8 +115,8 @@ def robustness(climb: Climb, ladder: LadderRecord, rng: np.random.Generator) -> 
         areas.append(relative_area(fit, base, severities))
         curves[factor.name] = Curve(
             climb.levels[factor.name].sum(axis=0).astype(np.int64),
-            fit[0],
-            Interval(*severity_at(np.array(position), severities)),
+            fit[0] / climb.episodes,
+            Interval(*severity_at(np.array(position), severities).tolist()),
             _interval(areas[-1], climb.episodes),
         )
     rate = stats.wilson(int(climb.base.sum()), climb.episodes)
@@ -154,9 +154,11 @@ def margin_difference(a: Climb, b: Climb, ladder: LadderRecord, rng: np.random.G
 
 
 def _fits(climb: Climb, counts: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Success rates at the base (R,) and isotonic fits (R, L) by factor, of every resample (R, N)."""
-    fits = {name: isotonic(counts @ solved / climb.episodes) for name, solved in climb.levels.items()}
-    return counts @ climb.base / climb.episodes, fits
+    """Successes at the base (R,) and their isotonic fits (R, L) by factor, of every resample (R, N).
+
+    Whole numbers rather than rates: half of a base is then met exactly.
+    """
+    return counts @ climb.base, {name: isotonic(counts @ solved) for name, solved in climb.levels.items()}
 
 
 def _interval(values: FloatArray, episodes: int) -> Interval:

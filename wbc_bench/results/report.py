@@ -18,6 +18,7 @@ from wbc_bench.readers import read_bytes, read_json, read_text
 from wbc_bench.results import gallery
 from wbc_bench.results.analysis import Evaluated, rule_of
 from wbc_bench.results.formatting import window_text
+from wbc_bench.results.stress import Stress
 from wbc_bench.results.table import code_html, read_markdown
 
 CSS = """
@@ -78,6 +79,7 @@ CAPTIONS = {  # end of a figure's name -> what it shows; {window} is that of the
     "that never rises; a cross is where half of the base's success is lost, the base stands on the left.",
     "tracking": "Error of the hand over time while its target moves.",
 }
+NO_RUN = "No run of a protocol yet. The runs of a ladder stand in the notes of its table of margins."
 REACH_CAPTION = (
     "Straight ahead over height: success, the range reached, and in the {window} the position error and "
     "how the hand oscillates, as speed and as smoothness (spectral arc length, 0 is smoothest)."
@@ -158,13 +160,13 @@ def write(
     results_dir: Path | str,
     beside: Path | str | None = None,
     studies: Mapping[str, str] | None = None,
-    ladders: Sequence[str] = (),
+    ladders: Sequence[Stress] = (),
 ) -> Path:
     """Writes `<results_dir>/report.html` from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
     will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol; `ladders`
-    are names of severity ladders, whose tables and figures form a section each.
+    are severity ladders, whose tables and figures form a section each.
 
     Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
     """
@@ -178,7 +180,7 @@ def write(
     ]
     # A section per protocol: its files begin with its name or a study's; the longest such name owns a file.
     protocols = list(evaluated)
-    parts_of_report = [*protocols, *ladders, "tracking", "doors"]
+    parts_of_report = [*protocols, *(stress.ladder.name for stress in ladders), "tracking", "doors"]
     section_of = {name: of for name, of in (studies or {}).items() if of in protocols}
     section_of |= {name: name for name in parts_of_report}
 
@@ -205,14 +207,15 @@ def write(
         if own:
             sections.append((title, "".join(figure_html(path, given_caption(path)) for path in own)))
     sections.append(
-        ("Where the numbers come from", provenance_html(records) if records else "<p>No run yet.</p>")
+        ("Where the numbers come from", provenance_html(records) if records else f"<p>{NO_RUN}</p>")
     )
     links = "".join(f'<a href="#s{k}">{html.escape(name)}</a>' for k, (name, _) in enumerate(sections))
     body = "".join(
         f'<h2 id="s{k}">{html.escape(name)}</h2>\n{part}' for k, (name, part) in enumerate(sections)
     )
-    controllers = len({record.controller for record in records})
-    episodes = sum(record.completed for record in records)
+    climbed = [record for stress in ladders for climb in stress.climbs for record in climb.records]
+    controllers = len({record.controller for record in (*records, *climbed)})
+    episodes = sum(record.completed for record in (*records, *climbed))
     lead = f"{episodes} episodes, {controllers} controllers, {len(protocols)} protocols"
     path = root / "report.html"
     path.parent.mkdir(parents=True, exist_ok=True)
