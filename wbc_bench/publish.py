@@ -20,6 +20,7 @@ from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
+from wbc_bench.results.margins import analyse
 from wbc_bench.results.store import ResultStore
 from wbc_bench.results.stress import read_stress
 from wbc_bench.results.study import Study, StudyError, labels_of, released_rows, released_studies, studies_of
@@ -77,8 +78,9 @@ def publish(
             _write_tracks(tracks, made, labels, colours)
             _write_doors(doors, made, labels)
             for stress in ladders:
-                write_stress_tables(stress, made / "tables")
-                write_stress_figure(stress, made / "figures", colours)
+                found = analyse(stress)
+                write_stress_tables(stress, found, made / "tables")
+                write_stress_figure(stress, found, made / "figures", colours)
             protocol_of = {study.name: study.protocol for study in known_studies}
             report.write(evaluated, made, out, protocol_of, ladders)
             return [

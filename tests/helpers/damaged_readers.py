@@ -37,6 +37,7 @@ from wbc_bench.errors import BenchError
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.results.analysis import collect_all
 from wbc_bench.results.doors import door_table, read_doors, write_doors
+from wbc_bench.results.margins import analyse
 from wbc_bench.results.report import figure_html, given_caption
 from wbc_bench.results.run_writer import RunWriter
 from wbc_bench.results.store import ResultStore, RunKey, ShardCost
@@ -218,8 +219,9 @@ def write_climbs(folder: Path) -> None:
 
 def read_climbs(folder: Path) -> None:
     for stress in read_stress(folder):
-        breaking_table(stress).markdown()
-        curve_table(stress).markdown()
+        found = analyse(stress)
+        breaking_table(stress, found).markdown()
+        curve_table(stress, found).markdown()
 
 
 def seal_climbs(folder: Path) -> None:

@@ -33,10 +33,11 @@ TWO = Stress(
         climb("none", 0, payload=[0, 0, 0, 0], slope=[0, 0]),
     ),
 )
+FOUND = analyse(TWO)
 
 
 def test_breaking_points_are_grouped_by_factor():
-    rows = breaking_table(TWO).rows
+    rows = breaking_table(TWO, FOUND).rows
     assert [row[:4] for row in rows] == [
         ("Payload (kg) 0 to 4", "a", "80.0", "20.0"),
         ("", "b", "80.0", "80.0"),
@@ -47,12 +48,12 @@ def test_breaking_points_are_grouped_by_factor():
     assert rows[0][4].startswith("2 [") and rows[0][5].startswith("0.56 [")
     assert rows[1][4:] == ("not reached [not reached, not reached]", "1.00 [1.00, 1.00]")
     assert rows[2][4:] == ("–", "–")
-    data = breaking_table(TWO).data
+    data = breaking_table(TWO, FOUND).data
     assert data["breaking"].tolist()[:2] == [2.0, np.inf] and np.isnan(data["breaking"][2])
 
 
 def test_margins_say_how_many_factors_they_are_over():
-    rows = margin_table(TWO).rows
+    rows = margin_table(TWO, FOUND).rows
     assert [(row[0], row[1], row[3]) for row in rows] == [
         ("a", "20", "2/2"),
         ("b", "20", "1/2"),
@@ -72,7 +73,7 @@ def test_differences_are_over_what_both_have():
 
 
 def test_curves_have_a_row_for_every_level_and_controller():
-    table = curve_table(TWO)
+    table = curve_table(TWO, FOUND)
     assert table.rows[0][:2] == ("Base", "") and table.rows[1][:3] == ("Payload (kg)", "0", "80 [58, 92]")
     assert table.rows[5][:2] == ("Slope (rad)", "0") and table.rows[5][3] == "–"
     data = table.data
@@ -85,8 +86,8 @@ def test_equal_records_give_equal_files(tmp_path):
     stress = made_up()
     turned = replace(stress, climbs=tuple(replace(one) for one in stress.climbs))
     for name, each in (("a", stress), ("b", turned)):
-        write_stress_tables(each, tmp_path / name)
-        write_stress_figure(each, tmp_path / name)
+        write_stress_tables(each, analyse(each), tmp_path / name)
+        write_stress_figure(each, analyse(each), tmp_path / name)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert {"made.md", "made_breaking.tex", "made_curves.csv", "made_pairs.md", "made_ladders.svg"} <= set(
         files

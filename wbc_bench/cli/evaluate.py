@@ -133,6 +133,7 @@ class Stress(_Evaluation):
         from wbc_bench.evaluation.stress import evaluate_stress
         from wbc_bench.evaluation.workers import Engine
         from wbc_bench.publish import publish
+        from wbc_bench.results.margins import analyse
         from wbc_bench.results.store import ResultStore
         from wbc_bench.results.stress import read_stress
         from wbc_bench.results.study import labels_of, released_rows
@@ -146,8 +147,9 @@ class Stress(_Evaluation):
         publish(ResultStore(self.out), self.out)
         for stress in read_stress(self.out, labels_of(released_rows())):
             if stress.ladder.name == ladder.name:
-                for table in (breaking_table(stress), margin_table(stress)):
-                    print_table(table)
+                found = analyse(stress)
+                print_table(breaking_table(stress, found))
+                print_table(margin_table(stress, found))
         print(f"tables, figures and report.html are under {self.out}")
 
 

@@ -79,7 +79,7 @@ CAPTIONS = {  # end of a figure's name -> what it shows; {window} is that of the
     "that never rises; a cross is where half of the base's success is lost, the base stands on the left.",
     "tracking": "Error of the hand over time while its target moves.",
 }
-NO_RUN = "No run of a protocol yet. The runs of a ladder stand in the notes of its table of margins."
+LADDERS_ONLY = "All runs are of ladders: the notes of their tables of margins say where they come from."
 REACH_CAPTION = (
     "Straight ahead over height: success, the range reached, and in the {window} the position error and "
     "how the hand oscillates, as speed and as smoothness (spectral arc length, 0 is smoothest)."
@@ -206,14 +206,13 @@ def write(
         own = [_figure(beside, stem) for stem in given if stem.startswith(prefix)]
         if own:
             sections.append((title, "".join(figure_html(path, given_caption(path)) for path in own)))
-    sections.append(
-        ("Where the numbers come from", provenance_html(records) if records else f"<p>{NO_RUN}</p>")
-    )
+    climbed = [record for stress in ladders for climb in stress.climbs for record in climb.records]
+    origin = f"<p>{LADDERS_ONLY if climbed else 'No run yet.'}</p>"
+    sections.append(("Where the numbers come from", provenance_html(records) if records else origin))
     links = "".join(f'<a href="#s{k}">{html.escape(name)}</a>' for k, (name, _) in enumerate(sections))
     body = "".join(
         f'<h2 id="s{k}">{html.escape(name)}</h2>\n{part}' for k, (name, part) in enumerate(sections)
     )
-    climbed = [record for stress in ladders for climb in stress.climbs for record in climb.records]
     controllers = len({record.controller for record in (*records, *climbed)})
     episodes = sum(record.completed for record in (*records, *climbed))
     lead = f"{episodes} episodes, {controllers} controllers, {len(protocols)} protocols"

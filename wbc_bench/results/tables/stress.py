@@ -14,7 +14,6 @@ from wbc_bench.results.margins import (
     LOST,
     Interval,
     Robustness,
-    analyse,
     margin_difference,
 )
 from wbc_bench.results.stress import FactorRecord, Stress
@@ -28,9 +27,8 @@ INTERVALS = (
 )
 
 
-def margin_table(stress: Stress, found: Mapping[str, Robustness] | None = None) -> Table:
-    """Success at the base and margin of each controller; `found` is `analyse(stress)` where it is known."""
-    found = analyse(stress) if found is None else found
+def margin_table(stress: Stress, found: Mapping[str, Robustness]) -> Table:
+    """Success at the base and margin of each controller; `found` is `analyse(stress)`."""
     ladder, rows, data = stress.ladder, [], []
     for climb in stress.climbs:
         base, curves, margin = found[climb.spec]
@@ -60,9 +58,8 @@ def margin_table(stress: Stress, found: Mapping[str, Robustness] | None = None) 
     return Table(ladder.name, title, header, tuple(rows), notes, pd.DataFrame(data))
 
 
-def breaking_table(stress: Stress, found: Mapping[str, Robustness] | None = None) -> Table:
+def breaking_table(stress: Stress, found: Mapping[str, Robustness]) -> Table:
     """Breaking point of each controller under each factor."""
-    found = analyse(stress) if found is None else found
     ladder, rows, data = stress.ladder, [], []
     for factor in ladder.factors:
         first, last = factor.severities[[0, -1]]
@@ -115,9 +112,8 @@ def difference_table(stress: Stress) -> Table:
     return Table(f"{ladder.name}_pairs", title, header, tuple(rows), notes, pd.DataFrame(data))
 
 
-def curve_table(stress: Stress, found: Mapping[str, Robustness] | None = None) -> Table:
+def curve_table(stress: Stress, found: Mapping[str, Robustness]) -> Table:
     """Success at every level, a column per controller; the file of numbers has a row for each."""
-    found = analyse(stress) if found is None else found
     ladder, data = stress.ladder, []
     rates = {climb.spec: found[climb.spec].base for climb in stress.climbs}
     rows = [("Base", "", *(interval_text(rate, 100.0, 0) for rate in rates.values()))]
@@ -141,9 +137,8 @@ def curve_table(stress: Stress, found: Mapping[str, Robustness] | None = None) -
     return Table(f"{ladder.name}_curves", title, header, tuple(rows), notes, pd.DataFrame(data))
 
 
-def write_stress_tables(stress: Stress, out_dir: Path | str) -> list[Path]:
+def write_stress_tables(stress: Stress, found: Mapping[str, Robustness], out_dir: Path | str) -> list[Path]:
     """The tables of a ladder (three without a pair to compare), into `out_dir`: `<results>/tables`."""
-    found = analyse(stress)
     tables = [make(stress, found) for make in (margin_table, breaking_table, curve_table)]
     tables.append(difference_table(stress))
     return [path for table in tables if table.rows for path in table.write(Path(out_dir))]
