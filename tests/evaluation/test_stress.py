@@ -1,6 +1,7 @@
 """An evaluation on a severity ladder: resumed, grown and reused like any other, and seen again."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from wbc_bench.episodes.ladder import find_ladder
 from wbc_bench.errors import BenchError, StoreError, UnknownNameError
 from wbc_bench.evaluation import workers as workers_module
 from wbc_bench.evaluation.evaluate import EvaluationError
-from wbc_bench.evaluation.stress import evaluate_stress
+from wbc_bench.evaluation.stress import allow_open_files, evaluate_stress
 from wbc_bench.evaluation.workers import Engine
 from wbc_bench.publish import publish
 from wbc_bench.results.store import ResultStore
@@ -106,6 +107,18 @@ def test_killed_then_resumed(tiny, tmp_path):
     climbed(tiny, tmp_path / "whole", spec)
     found = record_bytes(tmp_path / "out")
     assert found == record_bytes(tmp_path / "whole") and kept.items() <= found.items()
+
+
+def test_as_many_runs_may_be_open_as_there_are_levels():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft - 10, hard))
+        allow_open_files(soft - 20)
+        assert resource.getrlimit(resource.RLIMIT_NOFILE) == (soft - 10, hard)  # it is never lowered
+        allow_open_files(soft)
+        assert resource.getrlimit(resource.RLIMIT_NOFILE) == (soft, hard)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_another_ladder_of_that_name_is_refused(tiny, tmp_path):

@@ -1,5 +1,6 @@
 """Controllers on a severity ladder: all levels of all controllers are jobs of one evaluation."""
 
+import resource
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from wbc_bench.results.stress import (
     stress_folder,
 )
 from wbc_bench.robot import load_robot
+
+SPARE_FILES = 256  # open besides the locks of runs: libraries, pipes to workers
 
 
 def evaluate_stress(
@@ -69,10 +72,19 @@ def evaluate_stress(
             for spec in specs
             for level in levels
         ]
+        allow_open_files(len(jobs) + SPARE_FILES)  # a lock for each run
         run_jobs(jobs, store, engine, overwrite)
         for level in levels:
             store.keep_protocol(level.protocol.name, level.path, level.path.with_suffix(".parquet"))
     return store
+
+
+def allow_open_files(count: int) -> None:
+    """Raise the number of files that this process may hold open to `count`, as far as the system lets it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = count if hard == resource.RLIM_INFINITY else min(count, hard)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def ladder_record(ladder: Ladder) -> LadderRecord:
