@@ -59,7 +59,7 @@ def stress_panel(
         [severities[0] + BASE_AT * span, *shown], ["base", *(f"{severity:g}" for severity in shown)]
     )
     ax.set_title(factor.label)
-    ax.set_xlabel(factor.unit if factor.unit not in ("", "1") else "")
+    ax.set_xlabel(factor.unit)
     return ax
 
 
