@@ -88,20 +88,26 @@ def test_an_episode_of_a_level_is_seen_again(tiny, tmp_path):
 
 
 def test_killed_then_resumed(tiny, tmp_path):
-    spec = write_controller(tmp_path, "slow_controller", "time.sleep(0.02)")
+    """While the third level is computed, and the controller waits for as long as a file is there."""
+    stop, runs = tmp_path / "stop", "stress/*/runs/*/*/*/run.json"
+    stop.touch()
+    third = f"len(list(Path({str(tmp_path / 'out')!r}).glob({runs!r}))) == 2"
+    waits = f"while Path({str(stop)!r}).exists() and {third}: time.sleep(0.05)"
+    spec = write_controller(tmp_path, "waiting_controller", waits)
     command = [sys.executable, "-m", "wbc_bench", "stress", "--ladder", str(tiny), "--controller", spec]
-    command += ["--workers", "2", "--out", str(tmp_path / "out")]
+    command += ["--workers", "1", "--out", str(tmp_path / "out")]
     process = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 120
-        while len(record_bytes(tmp_path / "out")) < 2:
+        while len(list((tmp_path / "out").glob(runs))) < 2:
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.01)
     finally:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
+    stop.unlink()
     kept = record_bytes(tmp_path / "out")
-    assert 2 <= len(kept) < LEVELS
+    assert len(kept) == 2
     publish(ResultStore(tmp_path / "out"), tmp_path / "out")  # what is whole has a report already
     climbed(tiny, tmp_path / "out", spec)
     climbed(tiny, tmp_path / "whole", spec)
