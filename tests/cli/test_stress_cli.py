@@ -70,7 +70,7 @@ def test_a_level_out_of_range_is_one_line(capsys, tmp_path):
 
 def test_an_unknown_ladder_comes_with_the_nearest(capsys, tmp_path):
     line = fails(capsys, *words("stres_v1", tmp_path / "out"))
-    assert "unknown ladder 'stres_v1' (--ladder): did you mean stress_v1?" in line
+    assert "unknown ladder 'stres_v1' (--ladder): did you mean stress_v1 or stress_v2?" in line
     line = fails(capsys, *words(tmp_path / "none.toml", tmp_path / "out"))
     assert "none.toml' does not exist" in line
 

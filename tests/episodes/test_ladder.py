@@ -48,7 +48,7 @@ def differing(a: EpisodeManifest, b: EpisodeManifest) -> set[str]:
 def released(tmp_path_factory) -> tuple[Ladder, dict[str, FrozenLevel]]:
     """The mildest and the most severe level of every factor of the released ladder, twelve episodes each."""
     folder = tmp_path_factory.mktemp("levels")
-    text = (FOLDER / "stress_v1.toml").read_text()
+    text = (FOLDER / "stress_v2.toml").read_text()
     path = folder / "short.toml"
     path.write_text(text.replace("episodes = 100", "episodes = 12"))
     ladder = find_ladder(str(path))
@@ -80,9 +80,10 @@ def test_the_base_is_the_beginning_of_its_protocol(released):
     assert changed == {"name", "episodes"}
 
 
-def test_the_released_ladder_has_every_factor_and_six_levels():
-    ladder = find_ladder("stress_v1")
-    assert ladder_names() == ["stress_v1"]
+@pytest.mark.parametrize(("name", "base"), [("stress_v1", "ablation_v1"), ("stress_v2", "ablation_v2")])
+def test_a_released_ladder_has_every_factor_and_six_levels(name, base):
+    ladder = find_ladder(name)
+    assert name in ladder_names() and ladder.source.name == base
     assert {factor.name for factor in ladder.factors} == COLUMNS.keys()
     assert {len(factor.levels) for factor in ladder.factors} == {6}
     assert ladder.episodes == 100
@@ -154,8 +155,8 @@ def test_mistakes_are_one_line_with_the_field(tmp_path, old, new, message):
 
 
 def test_unknown_names_come_with_the_nearest(tmp_path):
-    with pytest.raises(UnknownNameError, match="did you mean stress_v1"):
-        find_ladder("stress_v2")
+    with pytest.raises(UnknownNameError, match="did you mean stress_v2"):
+        find_ladder("stres_v2")
     ladder = find_ladder(str(write_ladder(tmp_path)))
     with pytest.raises(UnknownNameError, match="did you mean friction"):
         ladder.only(["frictoin"])

@@ -121,7 +121,7 @@ class Stress(_Evaluation):
 
     controller: tuple[str, ...] = tyro.MISSING
     """Controllers to evaluate, each a name, name:variant, module:attribute or file.py:attribute."""
-    ladder: str = "stress_v1"
+    ladder: str = "stress_v2"
     """Name of a released ladder, or path of a .toml file: disturbances and their levels over a protocol."""
     factors: tuple[str, ...] = ()
     """Names of the ladder's disturbances to evaluate; all of them when not given."""
