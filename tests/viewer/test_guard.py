@@ -1,22 +1,11 @@
 """The live page answers whoever has its address, and no other page of the same browser."""
 
-import http.client
 from urllib.parse import urlsplit
 
 import pytest
 
-from live_page import Served
+from live_page import Served, connect, cookie_of, get
 from wbc_bench.viewer.guard import Guard
-
-
-def get(page: Served, path: str, **headers: str) -> tuple[int, str, str]:
-    """Status, body and cookie of a request to the page."""
-    place = urlsplit(page.url)
-    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=20)
-    names = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request("GET", path, headers={"Host": place.netloc} | names)
-    answer = connection.getresponse()
-    return answer.status, answer.read().decode(errors="replace"), answer.getheader("Set-Cookie") or ""
 
 
 def test_the_token_opens_the_page_and_a_cookie_keeps_it_open(served: Served) -> None:
@@ -26,7 +15,9 @@ def test_the_token_opens_the_page_and_a_cookie_keeps_it_open(served: Served) -> 
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
     mine = cookie.split(";")[0]
     assert get(served, "/", Cookie=mine)[0] == 200
-    assert get(served, "/", Cookie=f"other=1; {mine}")[0] == 200
+    for others in ("other=1", 'their={"a": 1, "b": [2]}', "no cookie at all", "a b=c", 'x="open'):
+        assert get(served, "/", Cookie=f"{others}; {mine}")[0] == 200, others
+        assert get(served, "/", Cookie=f"{mine}; {others}")[0] == 200, others
 
 
 @pytest.mark.parametrize(
@@ -47,21 +38,24 @@ def test_everybody_else_is_refused(served: Served, headers: dict[str, str], word
     assert status == 403 and words in body and not cookie
 
 
+def test_a_request_that_cannot_be_read_is_refused() -> None:
+    """Its address is none, or two headers stand where one may."""
+    from websockets.datastructures import Headers
+
+    guard = Guard(remote=False)
+    assert guard.refusal("//[::1", Headers(Host="localhost:8080")) == "the request cannot be read"
+    twice = Headers(Host="localhost:8080")
+    twice["Host"] = "localhost:8081"
+    assert guard.refusal("/", twice) == "the request cannot be read"
+
+
 def test_a_socket_needs_the_origin_of_the_page_and_the_token(served: Served) -> None:
-    sync = pytest.importorskip("websockets.sync.client")
+    pytest.importorskip("websockets.sync.client")
     from websockets.exceptions import InvalidStatus
 
-    place = urlsplit(served.url)
-    cookie = get(served, f"/?{place.query}")[2].split(";")[0]
-
-    def connect(origin: str | None, cookie: str | None):
-        headers = {"Cookie": cookie} if cookie else {}
-        return sync.connect(
-            f"ws://{place.netloc}", origin=origin, additional_headers=headers, subprotocols=["viser-v1.1.1"]
-        )
-
+    place, cookie = urlsplit(served.url), cookie_of(served)
     here = f"http://{place.netloc}"
-    with connect(here, cookie):
+    with connect(served, here, cookie):
         pass
     port = (place.port or 0) + 1
     for origin, given in (
@@ -70,7 +64,7 @@ def test_a_socket_needs_the_origin_of_the_page_and_the_token(served: Served) -> 
         (None, cookie),
         (here, None),
     ):
-        with pytest.raises(InvalidStatus) as refused, connect(origin, given):
+        with pytest.raises(InvalidStatus) as refused, connect(served, origin, given):
             pass
         assert refused.value.response.status_code == 403
 
@@ -88,6 +82,18 @@ def test_a_remote_page_is_opened_by_address_or_name_but_not_by_another_s_name() 
 
     assert not any(map(refused, ("192.168.1.7:8080", "[fe80::1]:8080", f"{socket.gethostname()}:8080")))
     assert "host" in refused("rebound.example:8080")
+
+
+def test_headers_that_are_there_twice_are_refused() -> None:
+    from websockets.datastructures import Headers
+
+    guard = Guard(remote=False)
+    path = "/?" + urlsplit(guard.address("127.0.0.1", 8080)).query
+    here = ("Host", "127.0.0.1:8080"), ("Origin", "http://127.0.0.1:8080")
+    assert guard.refusal(path, Headers(here)) == ""
+    for again in (("Host", "evil.example"), ("Origin", "http://evil.example")):
+        assert "cannot be read" in guard.refusal(path, Headers([*here, again]))
+    assert "cannot be read" in guard.refusal("//[" + path, Headers(here))
 
 
 def test_two_pages_have_two_tokens() -> None:

@@ -13,7 +13,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from unittest import mock
 from urllib.parse import parse_qs, urlsplit
@@ -36,16 +35,22 @@ class Guard:
 
     def refusal(self, path: str, headers: Any) -> str:
         """Why a request is refused; empty when it is not."""
+        try:
+            return self._refusal(path, headers)
+        except (ValueError, LookupError):  # no address, no text, or two headers where there is one
+            return "the request cannot be read"
+
+    def _refusal(self, path: str, headers: Any) -> str:
         host = headers.get("Host", "")
         try:
             name = urlsplit(f"//{host}").hostname or ""
         except ValueError:  # no address at all
             name = ""
         if not self._is_here(name):
-            return f"host '{host}' is not the address of this page"
+            return f"host {host!a} is not the address of this page"
         origin = headers.get("Origin")
         if origin is not None and origin != f"http://{host}":
-            return f"origin '{origin}' is not this page"
+            return f"origin {origin!a} is not this page"
         if origin is None and headers.get("Upgrade", "").lower() == "websocket":
             return "a socket of no page"
         given = parse_qs(urlsplit(path).query).get("token", [""])[0] or self._cookie(headers, host)
@@ -66,11 +71,12 @@ class Guard:
         return _is_address(name) or name in (socket.gethostname().lower(), socket.getfqdn().lower())
 
     def _cookie(self, headers: Any, host: str) -> str:
-        try:
-            found = SimpleCookie(", ".join(headers.get_all("Cookie"))).get(_cookie_name(host))
-        except CookieError:
-            return ""
-        return found.value if found else ""
+        """The token in the cookie; other servers of this machine have cookies too, of whatever form."""
+        for part in ";".join(headers.get_all("Cookie")).split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == _cookie_name(host):
+                return value
+        return ""
 
 
 @contextmanager
@@ -99,6 +105,19 @@ def guarded(guard: Guard) -> Iterator[None]:
 
     with _PATCHING, mock.patch.object(server, "serve", serve_guarded):
         yield
+
+
+def accept_values_only(server: Any) -> None:
+    """Let what a page sends change the value of a control and nothing else of it.
+
+    viser 1.1.1 sets whatever attribute of a control a message names, its label or its callbacks too.
+    """
+    from viser._messages import GuiUpdateMessage
+
+    def strip(_: Any, message: Any) -> None:
+        message.updates = {name: value for name, value in message.updates.items() if name == "value"}
+
+    server.gui._websock_interface._incoming_handlers[GuiUpdateMessage].insert(0, strip)
 
 
 def _cookie_name(host: str) -> str:

@@ -14,7 +14,7 @@ from wbc_bench.episodes.protocol import Success
 from wbc_bench.errors import BenchError, missing_extra
 from wbc_bench.robot import Robot, Scene
 from wbc_bench.rotations import wxyz_from_matrix
-from wbc_bench.viewer.guard import Guard, guarded
+from wbc_bench.viewer.guard import Guard, accept_values_only, guarded
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 
 Array = NDArray[np.float64]
@@ -50,6 +50,7 @@ def serving(host: str = "127.0.0.1", port: int = 8080, guard: Guard | None = Non
                 server = viser.ViserServer(host=host, port=port, verbose=False)
         except OSError as error:
             raise BenchError(f"cannot listen on {host}, port {port}: {error}") from error
+    accept_values_only(server)
     try:
         yield server
     finally:
