@@ -13,7 +13,7 @@ from wbc_bench.errors import UnknownNameError
 
 if TYPE_CHECKING:
     from wbc_bench.results.tracking import Tracked
-from wbc_bench.cli.common import RESULTS, UsageError, check_port, host, not_negative, print_table
+from wbc_bench.cli.common import RESULTS, UsageError, check_port, drawing, host, not_negative, print_table
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Track:
     """Folder to write records, table and figure to."""
 
     def run(self) -> None:
+        drawing()
         from wbc_bench.episodes.single import CONDITIONS
         from wbc_bench.files import ensure_writable
         from wbc_bench.publish import publish_tracks
@@ -142,6 +143,7 @@ class Live:
     """Let other machines open the page, and move the robot."""
 
     def run(self) -> None:
+        drawing()
         from wbc_bench.episodes.single import LONGEST, free_episode
         from wbc_bench.viewer.live import serve
         from wbc_bench.viewer.session import Session
