@@ -261,3 +261,20 @@ def test_a_port_that_is_taken_is_refused() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(BenchError, match=f"port {port} is in use"):
             serve("127.0.0.1", port, session_of("hold", "live"), print)
+
+
+@pytest.mark.parametrize(("choice", "seconds"), [("retreat", 5.0), ("hold", np.inf)])
+def test_what_a_silent_stream_does_is_an_option_of_the_page_too(monkeypatch, choice, seconds) -> None:
+    from wbc_bench.cli.main import main
+    from wbc_bench.sources.live import LiveSource
+
+    made = []
+
+    def load_source(name, protocol, config):
+        made.append((name, config.retreat_after))
+        return LiveSource()
+
+    monkeypatch.setattr("wbc_bench.viewer.session.load_source", load_source)
+    monkeypatch.setattr("wbc_bench.viewer.live.serve", lambda host, port, session, ready: session.close())
+    main(["live", "--controller", "hold", "--source", "stream", "--on-silence", choice])
+    assert made == [("stream", seconds)]

@@ -143,7 +143,7 @@ class Panel:
     def say(self, text: str) -> None:
         """One line about what went wrong, or nothing."""
         # the page shows Markdown, and HTML inside it; these words may be anybody's, e.g. of an exception
-        plain = re.sub(r"[\\`*_~<&\[]", r"\\\g<0>", text)
+        plain = re.sub(r"[\\`*_~<&\[{]", r"\\\g<0>", text)
         self._message.content, self._message.visible = f"⚠ {plain}", bool(text)
 
     def _toggle(self) -> None:

@@ -15,18 +15,28 @@ from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.sources import Source, StampedTarget, load_source, to_world
 from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.live import LiveSource
+from wbc_bench.sources.stream_filter import StreamConfig
 from wbc_bench.viewer.moment import PUSH_SECONDS, Array, Moment, moment_of
 
 
 class Session:
     """Steps a robot for as long as it stands; `moment` is the present one."""
 
-    def __init__(self, spec: str, source: str, protocol: EvalProtocol, row: EpisodeManifest) -> None:
+    def __init__(
+        self,
+        spec: str,
+        source: str,
+        protocol: EvalProtocol,
+        row: EpisodeManifest,
+        stream: StreamConfig = StreamConfig(),  # noqa: B008  (immutable)
+    ) -> None:
         """An episode (a manifest of one row, whose target nobody looks at); see `track.free_episode`.
+
+        `stream` is that of a source which is one.
 
         Raises: BenchError, whatever of these is unknown or cannot be loaded.
         """
-        self.protocol, self._row = protocol, row
+        self.protocol, self._row, self._stream = protocol, row, stream
         self.robot: Robot = load_robot(protocol.robot)
         self.spec, self.source_name = spec, source
         self.controller: Controller = load_controller(spec, self.robot)
@@ -133,7 +143,7 @@ class Session:
         return self._loop.target(self._pos_w[None], self._rot_w[None])
 
     def _load(self, name: str) -> Source:
-        return load_source(name, protocol=self.protocol)
+        return load_source(name, protocol=self.protocol, config=self._stream)
 
 
 def _look(source: Source, loop: ControlLoop) -> None:
