@@ -114,6 +114,37 @@ def test_torch_draws_the_same_whoever_imported_it(tmp_path: Path) -> None:
     assert torch.rand(1).item() == expected
 
 
+IMPORT_DRAWS = """
+{imports}
+AT_IMPORT = {draw}
+
+class Drawn(Mine):
+    def __init__(self, robot):
+        self.at_import, self.first = AT_IMPORT, {draw}
+"""
+
+
+@pytest.mark.parametrize("draw", ["random.random()", "np.random.rand()", "float(torch.rand(1))"])
+def test_what_an_import_draws_does_not_shift_the_factory(tmp_path: Path, draw: str) -> None:
+    """Nor does it depend on who imported PyTorch: workers and clients import at different times."""
+    torch = draw.startswith("float(torch")
+    if torch:
+        pytest.importorskip("torch")
+    path = tmp_path / "draws_at_import.py"
+    path.write_text(HEAD + IMPORT_DRAWS.format(draw=draw, imports="import torch" if torch else ""))
+    code = (
+        "{first}\nfrom wbc_bench.registry import load_controller\nfrom wbc_bench.robot import load_robot\n"
+        f"made = [load_controller('{path}:Drawn', load_robot()) for _ in range(2)]\n"
+        "print(*[(mine.at_import, mine.first) for mine in made], sep='\\n')"
+    )
+    found = [
+        subprocess.run([sys.executable, "-c", code.format(first=first)], capture_output=True, text=True)
+        for first in ("", "import torch; torch.rand(3)" if torch else "import random; random.random()")
+    ]
+    lines = [line for run in found for line in run.stdout.splitlines()]
+    assert len(lines) == 4 and len(set(lines)) == 1, [run.stderr for run in found]
+
+
 def test_streams_go_on_where_they_were_left() -> None:
     mine = GlobalRandomness(7)
     with mine.own():
@@ -179,8 +210,9 @@ def test_any_exception_comes_back_as_the_user_s_own_frames(tmp_path: Path, kind:
 def test_an_interrupt_raised_by_a_controller_is_its_fault_in_a_worker(tmp_path: Path) -> None:
     spec = controller(tmp_path, "interrupts", "def more(self, obs, target):\n    raise KeyboardInterrupt")
     place = "'mine' failed in `act` at control step 0 of episodes 0 to 5: KeyboardInterrupt"
-    with pytest.raises(ControllerError, match=rf"{place}: .*interrupts.py:\d+ in more"):
-        rows(spec, write_tiny(tmp_path), workers=2)
+    for engine in ("loky", "dask"):
+        with pytest.raises(ControllerError, match=rf"{place}: .*interrupts.py:\d+ in more"):
+            rows(spec, write_tiny(tmp_path), workers=2, engine=engine)
     with pytest.raises(KeyboardInterrupt):  # in the user's own process it may be the user's
         rows(spec, write_tiny(tmp_path), workers=1)
 
@@ -193,7 +225,8 @@ def __init__(self, robot):
         raise KeyboardInterrupt
 """
     spec = controller(tmp_path, "unmade_apart", body)
-    with pytest.raises(ControllerError, match=r"unmade_apart.py:Mine' raised KeyboardInterrupt"):
+    said = r"unmade_apart.py:Mine' cannot be made: KeyboardInterrupt: .*unmade_apart.py:\d+ in __init__"
+    with pytest.raises(ControllerError, match=said):
         rows(spec, write_tiny(tmp_path), workers=2)
 
 
@@ -201,6 +234,129 @@ def test_a_factory_that_fails_is_one_line(tmp_path: Path) -> None:
     spec = controller(tmp_path, "unmade", "def __init__(self, robot):\n    raise OSError('no such weights')")
     with pytest.raises(ControllerError, match=r"cannot be made: OSError: no such weights \(unmade.py:\d+ in"):
         rows(spec, write_tiny(tmp_path))
+
+
+ODD_COMMANDS = {
+    "np.full((6, 14), 'a')": r"commands of type <U1, e.g. .*'a'.*, at control step 0, valid: real numbers",
+    "np.full((6, 14), None)": "commands of type object, e.g. None, at",
+    "[[object()] * 14] * 6": "commands of type object, e.g. <object object at 0x",
+    "None": "commands of type object, e.g. None, at",
+    "np.zeros((6, 14), complex)": "commands of type complex128, e.g. .*0j.*, at",
+    "np.zeros((6, 14), 'datetime64[s]')": "commands of type datetime64",
+    "[[0.0] * 14] * 5 + [[0.0]]": r"failed in `act` at control step 0 .*; commands are no array, expected",
+    "{'q': 0.0}": "commands of type object",
+    "np.zeros((6, 13))": r"commands of shape \(6, 13\), expected \(6, 14\)",
+    "np.zeros((6, 14)), ['no'] * 6": "`infeasible` of type <U2, e.g. .*'no'.*, at .*, valid: booleans",
+    "np.zeros((6, 14)), np.zeros(5, bool)": r"`infeasible` of shape \(5,\), expected \(6,\)",
+}
+
+
+@pytest.mark.parametrize("command", ODD_COMMANDS)
+def test_a_command_that_is_no_array_of_numbers_is_one_line(tmp_path: Path, command: str) -> None:
+    body = f"def act(self, obs, target):\n    return JointCommand({command})"
+    spec = controller(tmp_path, f"odd_{list(ODD_COMMANDS).index(command)}", body)
+    with pytest.raises(ControllerError, match=ODD_COMMANDS[command]) as caught:
+        rows(spec, write_tiny(tmp_path))
+    assert "controller 'mine'" in str(caught.value) and len(str(caught.value)) < 700
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [
+        ("'mine', frozenset(), '0.02', 'test'", "has the control period '0.02', valid: a number"),
+        ("'mine', frozenset(), 0.02, 'test', (5,)", r"has `info.files` \(5,\), valid: paths"),
+        ("'mine', None, 0.02, 'test'", "cannot be made: TypeError: 'NoneType' object is not iterable"),
+    ],
+)
+def test_an_odd_info_is_one_line(tmp_path: Path, info: str, said: str) -> None:
+    name = f"odd_info_{abs(hash(info))}"
+    spec = controller(tmp_path, name, f"info = ControllerInfo({info})")
+    with pytest.raises(ControllerError, match=said):
+        rows(spec, write_tiny(tmp_path))
+
+
+INSTALLED = """
+class Factory:
+    def __call__(self, robot, variant=""):
+        return Mine(robot)
+
+    def variants(self):
+        {variants}
+
+    def variant_for(self, variant, replicate):
+        {variant_for}
+
+class Mine(Mine):
+    formats = ("bin",)
+
+    def export(self, path, format):
+        path.write_text("half")
+        {export}
+
+make = Factory()
+"""
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch, **bodies: str) -> None:
+    """Have a file stand as the installed controller `theirs`, some of whose methods are given."""
+    from importlib.metadata import EntryPoint
+
+    from wbc_bench import installed, registry
+
+    plain = {"variants": "return [('', 'plain')]", "variant_for": "return variant", "export": "pass"}
+    name = f"installed_{abs(hash(str(sorted(bodies.items()))))}"
+    (folder / f"{name}.py").write_text(HEAD + INSTALLED.format(**plain | bodies))
+    monkeypatch.syspath_prepend(folder)
+    found = {"theirs": EntryPoint("theirs", f"{name}:make", installed.ENTRY_POINTS)}
+    monkeypatch.setattr(installed, "controllers", lambda: found)
+    monkeypatch.setattr(registry, "controllers", lambda: found)
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "said"),
+    [
+        ("variant_for", "raise SystemExit(3)", "failed in `variant_for`: SystemExit: 3 (installed_"),
+        ("variant_for", "return None", "returned None from `variant_for`, valid: a text"),
+        ("export", "raise LookupError('no such op')", "failed in `export`: LookupError: no such op (inst"),
+        ("export", "path.unlink()", "failed in `export`: it wrote no file 'out.bin'"),
+        ("variants", "raise SystemExit(3)", "cannot be loaded: controller 'theirs' failed in `variants`"),
+        ("variants", "return [1, 2]", "cannot be loaded: controller 'theirs' failed in `variants`: TypeErr"),
+    ],
+)
+def test_a_factory_or_an_export_that_fails_is_one_line(
+    tmp_path: Path, monkeypatch, capsys, method: str, body: str, said: str
+) -> None:
+    from wbc_bench.cli.main import main
+
+    install(tmp_path, monkeypatch, **{method: body})
+    written = tmp_path / "made" / "out.bin"
+    written.parent.mkdir()
+    written.write_text("of before")
+    arguments = {
+        "variants": ["list", "--results", str(tmp_path)],
+        "export": ["export", "--controller", "theirs", "--format", "bin", "-o", str(written)],
+        "variant_for": ["eval", "--controller", "theirs", "--protocol", str(write_tiny(tmp_path))],
+    }[method]
+    if method == "variants":  # whoever wants the list gets the rest of it
+        main(arguments)
+        text = capsys.readouterr().out
+    else:
+        with pytest.raises(SystemExit, match="2"):
+            main(arguments)
+        text = capsys.readouterr().err
+        assert len(text.splitlines()) == 1
+    assert said in text
+    assert [file.name for file in written.parent.iterdir()] == ["out.bin"]
+    assert written.read_text() == "of before"
+
+
+def test_an_export_takes_the_place_of_the_one_before(tmp_path: Path, monkeypatch, capsys) -> None:
+    from wbc_bench.cli.main import main
+
+    install(tmp_path, monkeypatch, export="path.with_suffix('.data').write_text('weights')")
+    (tmp_path / "out.bin").write_text("of before")
+    main(["export", "--controller", "theirs", "--format", "bin", "-o", str(tmp_path / "out.bin")])
+    assert (tmp_path / "out.bin").read_text() == "half" and (tmp_path / "out.data").exists()
 
 
 def test_a_digest_that_fails_is_one_line(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""The global random streams of Python, NumPy and PyTorch, apart for each controller.
+"""Where code of a controller runs: its faults are one line, and global random streams are its own.
 
-Code of a controller may draw from them without knowing. Its results must then depend neither on what ran
-before in the process nor on how many workers there are, and must not change what others draw.
+It may draw from those of Python, NumPy and PyTorch without knowing. Its results must then depend neither on
+what ran before in the process nor on how many workers there are, and must not change what others draw.
 """
 
 # ruff: noqa: NPY002  (the legacy generator is what is kept apart here)
@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+
+from wbc_bench.errors import BenchError, ControllerError, fault_of
 
 
 class GlobalRandomness:
@@ -48,6 +50,30 @@ class GlobalRandomness:
             torch.random.set_rng_state(states["torch"])
         elif torch is not None:  # imported since; by itself it begins at the entropy of the machine
             torch.random.manual_seed(self._seed)
+
+
+@contextmanager
+def blamed(doing: str, randomness: GlobalRandomness | None = None) -> Iterator[None]:
+    """Where a controller's code runs; what it raises, `SystemExit` too, comes back with its own frames.
+
+    Args:
+        doing: What fails when it fails, e.g. "controller 'mine' failed in `act`".
+        randomness: Its global random streams; new ones when not given.
+
+    Raises:
+        ControllerError: It raised what is no `BenchError`.
+        KeyboardInterrupt: It raised one, or the user did: a worker knows. The line is its note.
+    """
+    try:
+        with (randomness or GlobalRandomness(0)).own():
+            yield
+    except BenchError:
+        raise
+    except KeyboardInterrupt as error:
+        error.add_note(f"{doing}: {fault_of(error)}")
+        raise
+    except BaseException as error:
+        raise ControllerError(f"{doing}: {fault_of(error)}") from error
 
 
 def _states() -> dict[str, Any]:

@@ -3,15 +3,17 @@
 import importlib
 import pickle
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 from wbc_bench import provenance
-from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, SeededFactory
-from wbc_bench.errors import BenchError, ControllerError, UnknownNameError, fault_of
+from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, HasVariants, SeededFactory
+from wbc_bench.errors import ControllerError, UnknownNameError
 from wbc_bench.installed import controllers
-from wbc_bench.isolation import GlobalRandomness
+from wbc_bench.isolation import blamed
 from wbc_bench.robot import Robot
 
 ControllerFactory = Callable[[Robot], Controller]
@@ -30,21 +32,31 @@ def load_controller(spec: str, robot: Robot) -> Controller:
     """
     had_torch = "torch" in sys.modules
     controller = _load(spec, robot)
-    # imported by this controller, it was not seeded yet when the controller was made
-    return controller if had_torch or "torch" not in sys.modules else _load(spec, robot)
+    if had_torch or "torch" not in sys.modules:
+        return controller
+    _forget(list(_LOADED))
+    return _load(spec, robot)  # imported by this controller, it was not seeded yet when that was made
 
 
 def _load(spec: str, robot: Robot) -> Controller:
     name, _, rest = spec.partition(":")
-    installed = controllers()
-    with _building(spec):
-        if name in installed:
-            controller = installed[name].load()(robot, rest)
-        elif rest:
-            controller = _load_attribute(name, rest)(robot)
-        else:
-            raise UnknownNameError("controller", spec, installed, "--controller; or give module:attribute")
-        return _checked(controller, spec)
+    if name in controllers():
+        factory, arguments = _installed(controllers()[name], spec), (robot, rest)
+    elif rest:
+        with _importing(spec):
+            factory, arguments = _load_attribute(name, rest), (robot,)
+    else:
+        where = "--controller; or give module:attribute"
+        raise UnknownNameError("controller", spec, controllers(), where)
+    # streams that begin anew: what an import draws is not drawn again where the module is loaded already
+    with blamed(f"controller '{spec}' cannot be made"):
+        return _checked(factory(*arguments), spec)
+
+
+def _installed(point: EntryPoint, spec: str) -> Any:
+    """The factory of an installed controller. Raises: ControllerError, it cannot be imported."""
+    with _importing(spec):
+        return point.load()
 
 
 def build_controller(source: str | bytes, robot: Robot) -> Controller:
@@ -54,7 +66,7 @@ def build_controller(source: str | bytes, robot: Robot) -> Controller:
     """
     if isinstance(source, str):
         return load_controller(source, robot)
-    with _building("handed over"):
+    with blamed("controller 'handed over' cannot be made"):
         found = pickle.loads(source)
         name = getattr(found, "__name__", type(found).__name__)
         if isinstance(found, type) or not hasattr(found, "act"):
@@ -63,17 +75,13 @@ def build_controller(source: str | bytes, robot: Robot) -> Controller:
 
 
 @contextmanager
-def _building(spec: str) -> Iterator[None]:
-    """What a user's code raises while a controller is made of it, in one line; global seeds are its own."""
-    try:
-        with GlobalRandomness(0).own():
+def _importing(spec: str) -> Iterator[None]:
+    """Where a controller's modules are imported; its faults are one line."""
+    with blamed(f"controller '{spec}' cannot be imported"):
+        try:
             yield
-    except (BenchError, KeyboardInterrupt):
-        raise
-    except ImportError as error:
-        raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
-    except BaseException as error:
-        raise ControllerError(f"controller '{spec}' cannot be made: {fault_of(error)}") from error
+        except ImportError as error:  # what is missing says enough
+            raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
 
 
 def pack_controller(controller: object) -> bytes:
@@ -101,6 +109,12 @@ def _checked(controller: Controller, spec: str) -> Controller:
         )
     if not isinstance(info.name, str) or not info.name.strip():
         raise ControllerError(f"controller '{spec}' has the name {info.name!r}, valid: a text, not empty")
+    if isinstance(info.control_period, bool) or not isinstance(info.control_period, int | float):
+        raise ControllerError(
+            f"controller '{spec}' has the control period {info.control_period!r}, valid: a number [s]"
+        )
+    if not all(isinstance(file, str | Path) for file in info.files):
+        raise ControllerError(f"controller '{spec}' has `info.files` {info.files!r}, valid: paths")
     for signal in sorted(info.signals):
         if signal not in SIGNALS:
             raise UnknownNameError("signal", signal, SIGNALS, f"declared by controller '{spec}'")
@@ -110,16 +124,31 @@ def _checked(controller: Controller, spec: str) -> Controller:
 def spec_of_replicate(spec: str, replicate: int) -> str:
     """The spec of the controller that meets one replicate: SPEC itself, unless its factory says otherwise.
 
-    Raises: ControllerError, the factory cannot be imported.
+    Raises: ControllerError, the factory cannot be imported, or fails.
     """
     name, _, variant = spec.partition(":")
-    if name not in (installed := controllers()):
+    if name not in controllers():
         return spec
-    try:
-        factory = installed[name].load()
-    except ImportError as error:
-        raise ControllerError(f"controller '{spec}' cannot be imported: {error}") from error
-    return f"{name}:{factory.variant_for(variant, replicate)}" if isinstance(factory, SeededFactory) else spec
+    factory = _installed(controllers()[name], spec)
+    if not isinstance(factory, SeededFactory):
+        return spec
+    with blamed(f"controller '{name}' failed in `variant_for`"):
+        met = factory.variant_for(variant, replicate)
+    if not isinstance(met, str):
+        raise ControllerError(f"controller '{name}' returned {met!r} from `variant_for`, valid: a text")
+    return f"{name}:{met}"
+
+
+def variants_of(point: EntryPoint) -> list[tuple[str, str]]:
+    """(variant, description) of an installed controller, as its factory names them.
+
+    Raises: ControllerError, the factory cannot be imported, or fails.
+    """
+    factory = _installed(point, point.name)
+    if not isinstance(factory, HasVariants):
+        return [("", "")]
+    with blamed(f"controller '{point.name}' failed in `variants`"):
+        return [(str(variant), str(description)) for variant, description in factory.variants()]
 
 
 def _load_attribute(module: str, attribute: str):
@@ -166,11 +195,16 @@ def _state_of(module: str) -> dict[Path, int]:
 
 def _forget_edited() -> None:
     """Have edited modules imported anew: the digest of a controller is that of the files on disk."""
-    for module, files in list(_LOADED.items()):
-        if module in sys.modules and _state_of(module) != files:
-            del _LOADED[module]
-            importlib.invalidate_caches()
-            for name, loaded in list(sys.modules.items()):
-                file = getattr(loaded, "__file__", None)
-                if file and Path(file).resolve() in files:
-                    del sys.modules[name]
+    loaded = [name for name in _LOADED if name in sys.modules]
+    _forget([name for name in loaded if _state_of(name) != _LOADED[name]])
+
+
+def _forget(modules: Iterable[str]) -> None:
+    """Have modules of the user imported anew, with what they import from their folders."""
+    for module in modules:
+        files = _LOADED.pop(module)
+        importlib.invalidate_caches()
+        for name, loaded in list(sys.modules.items()):
+            file = getattr(loaded, "__file__", None)
+            if file and Path(file).resolve() in files:
+                del sys.modules[name]

@@ -428,6 +428,29 @@ def test_a_missing_library_to_draw_with_is_one_line(tmp_path, words):
     )
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "robot show",
+        "film run --episode 0 --strip x.png",
+        "replay run --episode 0",
+        "live --controller hold",
+        "track --controller hold --source figure_eight",
+    ],
+)
+def test_a_mujoco_gl_that_does_not_exist_is_one_line(tmp_path, words):
+    done = subprocess.run(
+        [sys.executable, "-m", "wbc_bench", *words.split()],
+        cwd=tmp_path,
+        env=os.environ | {"MUJOCO_GL": "vulcan"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2 and done.stdout == ""
+    assert "MUJOCO_GL=vulcan" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 BROKEN_GL = """
 import builtins, sys
 inner = builtins.__import__

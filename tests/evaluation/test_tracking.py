@@ -432,3 +432,12 @@ def test_a_base_that_turns_does_not_turn_a_target_in_the_world() -> None:
     for target, base_w, rot_w in shown:
         np.testing.assert_allclose(rot_w @ target.pos_b[0] + base_w, pos_w, atol=1e-12)
         np.testing.assert_allclose(rot_w @ target.rot_b[0], matrix_from_wxyz(IDENTITY), atol=1e-12)
+
+
+def test_messages_of_an_unknown_clock_do_not_count_against_a_run() -> None:
+    from wbc_bench.evaluation.tracking import _check_used
+
+    _check_used({"accepted": 300, "late": 10, "clock_unknown": 5000})
+    for counts in ({"accepted": 0, "clock_unknown": 5000}, {"accepted": 300, "late": 301}):
+        with pytest.raises(SourceError, match="is not scored"):
+            _check_used(counts)

@@ -1,6 +1,7 @@
 """PlaCo and OSQP solve one and the same inverse-kinematics program."""
 
 import os
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -316,3 +317,31 @@ def test_placo_keeps_nothing_of_the_polygons_that_it_is_given() -> None:
     before = resident()
     steps(3000)
     assert resident() - before < 500  # [KiB]; it was 1500
+
+
+def test_solvers_take_over_the_wrapper_of_one_that_is_gone_and_step_alike() -> None:
+    """PlaCo never frees one; a solver on a used wrapper gives the very bytes of one on a new."""
+    from wbc_baselines.ik import placo_ik
+
+    def walk(solver: PlacoIK, height: float) -> list[bytes]:
+        q, path = START.q, []
+        for k in range(5):
+            ee = START.ee[0] + np.array([0.0, 0.0, height * (k + 1)]), START.ee[1]
+            q = solver.step(q, ee, START.soles, START.hull, ROBOT.default_q, POSTURE)
+            assert q is not None
+            path.append(q.tobytes())
+        return path
+
+    idle = placo_ik._IDLE.setdefault(ROBOT.urdf(), [])
+    idle.clear()  # those of other tests
+    first = PlacoIK(ROBOT, WEIGHTS, PERIOD)
+    other = PlacoIK(ROBOT, WEIGHTS, PERIOD)
+    assert first._robot is not other._robot and not idle  # two at a time share none
+    wanted, used = walk(first, 0.004), first._robot
+    del first
+    strict = PlacoIK(ROBOT, replace(WEIGHTS, joint_margin=0.1, speed_fraction=0.5), PERIOD)
+    assert strict._robot is used
+    walk(strict, -0.003)
+    del strict
+    again = PlacoIK(ROBOT, WEIGHTS, PERIOD)
+    assert again._robot is used and walk(again, 0.004) == wanted == walk(other, 0.004)

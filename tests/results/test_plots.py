@@ -97,3 +97,11 @@ def test_a_controller_keeps_its_colour_whoever_else_is_drawn():
         ax = error_cdf(Figure().subplots(), chosen, "position_error", mapping)
         drawn = {line.get_label(): line.get_color() for line in ax.get_lines()}
         assert all(drawn[label] == mapping[method.spec] for label, method in chosen)
+
+
+def test_no_two_controllers_share_a_colour_however_many_there_are() -> None:
+    from wbc_bench.results.figures.style import METHOD_COLOURS, controller_colours
+
+    found = controller_colours({f"c{k:02d}": f"name {k:02d}" for k in range(20)}, [])
+    assert len(set(found.values())) == 20
+    assert tuple(found.values())[: len(METHOD_COLOURS)] == METHOD_COLOURS

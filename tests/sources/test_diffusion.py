@@ -491,3 +491,9 @@ def test_the_packaged_policy_is_small_and_the_one_of_the_record() -> None:
 def test_track_stands_in_front_of_a_door() -> None:
     run, asked = track(load_controller("hold", load_robot()), load_source("diffusion"), "nominal", 0, 0.5)
     assert asked == 0.5 and np.isfinite(run.target_pos_w).all() and len(run.time) > 5
+
+
+def test_more_episodes_than_a_file_holds_are_refused_before_they_are_computed(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(demo, "_run_all", lambda *_: pytest.fail("episodes were computed"))
+    with pytest.raises(SourceError, match=r"2000000 episodes to record, valid: at most [0-9]+, of 1000000"):
+        demo.record(tmp_path / "d.zarr.zip", "hold", 0, 2_000_000)

@@ -1,22 +1,12 @@
 """The live page answers whoever has its address, and no other page of the same browser."""
 
-import http.client
 from urllib.parse import urlsplit
 
 import pytest
 
-from live_page import Served
+from live_page import Served, connect, cookie_of, free_port, get
+from wbc_bench.errors import BenchError
 from wbc_bench.viewer.guard import Guard
-
-
-def get(page: Served, path: str, **headers: str) -> tuple[int, str, str]:
-    """Status, body and cookie of a request to the page."""
-    place = urlsplit(page.url)
-    connection = http.client.HTTPConnection(place.hostname or "", place.port, timeout=20)
-    names = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request("GET", path, headers={"Host": place.netloc} | names)
-    answer = connection.getresponse()
-    return answer.status, answer.read().decode(errors="replace"), answer.getheader("Set-Cookie") or ""
 
 
 def test_the_token_opens_the_page_and_a_cookie_keeps_it_open(served: Served) -> None:
@@ -26,7 +16,9 @@ def test_the_token_opens_the_page_and_a_cookie_keeps_it_open(served: Served) -> 
     assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
     mine = cookie.split(";")[0]
     assert get(served, "/", Cookie=mine)[0] == 200
-    assert get(served, "/", Cookie=f"other=1; {mine}")[0] == 200
+    for others in ("other=1", 'their={"a": 1, "b": [2]}', "no cookie at all", "a b=c", 'x="open'):
+        assert get(served, "/", Cookie=f"{others}; {mine}")[0] == 200, others
+        assert get(served, "/", Cookie=f"{mine}; {others}")[0] == 200, others
 
 
 @pytest.mark.parametrize(
@@ -48,20 +40,12 @@ def test_everybody_else_is_refused(served: Served, headers: dict[str, str], word
 
 
 def test_a_socket_needs_the_origin_of_the_page_and_the_token(served: Served) -> None:
-    sync = pytest.importorskip("websockets.sync.client")
+    pytest.importorskip("websockets.sync.client")
     from websockets.exceptions import InvalidStatus
 
-    place = urlsplit(served.url)
-    cookie = get(served, f"/?{place.query}")[2].split(";")[0]
-
-    def connect(origin: str | None, cookie: str | None):
-        headers = {"Cookie": cookie} if cookie else {}
-        return sync.connect(
-            f"ws://{place.netloc}", origin=origin, additional_headers=headers, subprotocols=["viser-v1.1.1"]
-        )
-
+    place, cookie = urlsplit(served.url), cookie_of(served)
     here = f"http://{place.netloc}"
-    with connect(here, cookie):
+    with connect(served, here, cookie):
         pass
     port = (place.port or 0) + 1
     for origin, given in (
@@ -70,7 +54,7 @@ def test_a_socket_needs_the_origin_of_the_page_and_the_token(served: Served) -> 
         (None, cookie),
         (here, None),
     ):
-        with pytest.raises(InvalidStatus) as refused, connect(origin, given):
+        with pytest.raises(InvalidStatus) as refused, connect(served, origin, given):
             pass
         assert refused.value.response.status_code == 403
 
@@ -90,5 +74,50 @@ def test_a_remote_page_is_opened_by_address_or_name_but_not_by_another_s_name() 
     assert "host" in refused("rebound.example:8080")
 
 
+def test_headers_that_are_there_twice_are_refused() -> None:
+    from websockets.datastructures import Headers
+
+    guard = Guard(remote=False)
+    path = "/?" + urlsplit(guard.address("127.0.0.1", 8080)).query
+    here = ("Host", "127.0.0.1:8080"), ("Origin", "http://127.0.0.1:8080")
+    assert guard.refusal(path, Headers(here)) == ""
+    for again in (("Host", "evil.example"), ("Origin", "http://evil.example")):
+        assert "cannot be read" in guard.refusal(path, Headers([*here, again]))
+    assert "cannot be read" in guard.refusal("//[" + path, Headers(here))
+
+
 def test_two_pages_have_two_tokens() -> None:
     assert Guard(False).address("127.0.0.1", 1) != Guard(False).address("127.0.0.1", 1)
+
+
+@pytest.mark.parametrize("kind", ["everything", "sockets", "messages"])
+def test_a_viser_that_goes_around_the_guard_is_not_served(monkeypatch, kind: str) -> None:
+    """As a newer one might: it hands websockets no `process_request`, or one that skips what it likes."""
+    pytest.importorskip("viser")
+    import websockets.asyncio.server as server
+    from viser.infra import _infra
+
+    from wbc_bench.viewer.scene import serving
+
+    class Apart:
+        """Another module with the same `serve`, out of reach of the patch."""
+
+        @staticmethod
+        def serve(*args, process_request, **options):
+            def process(connection, request):
+                if kind == "sockets" and "Upgrade" not in request.headers:
+                    return connection.respond(403, "")
+                return process_request(connection, request)
+
+            return serve(*args, process_request=process, **options)
+
+    serve, real = server.serve, getattr(_infra, "websockets")  # noqa: B009  (not exported)
+    if kind == "messages":
+        gone = "viser._messages.GuiUpdateMessage"
+        monkeypatch.setattr("wbc_bench.viewer.scene.check_guarded", lambda *_: monkeypatch.delattr(gone))
+    else:
+        apart = type("websockets", (), {"asyncio": type("asyncio", (), {"server": Apart})})
+        apart.__getattr__ = lambda self, name: getattr(real, name)
+        monkeypatch.setattr(_infra, "websockets", apart())
+    with pytest.raises(BenchError, match=r"viser \S+ .*valid: viser 1.1.1"), serving(port=free_port()):
+        pass

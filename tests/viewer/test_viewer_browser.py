@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from live_page import Served, wait_for
+from wbc_bench.errors import BenchError
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 SOFTWARE = (
@@ -85,6 +86,9 @@ def test_the_hand_follows_the_dragged_gizmo_and_a_second_browser_sees_it(browser
     for one in (page, second):
         shown = one.locator("input").evaluate_all("all => all.map(input => input.value)")
         assert any(abs(float(value) - goal[2]) < 2e-3 for value in shown if _is_number(value)), shown
+    words = "KeyError: <class 'int'> &amp; *a* _b_ `c` [d](e) <img src=f> {1 + 1}"
+    view.ask(lambda: refuse(words))
+    second.wait_for_selector(f'text="⚠ {words}"', timeout=20_000)  # as it is, not as Markdown or HTML
     assert not problems, problems
 
 
@@ -122,6 +126,10 @@ def test_a_page_of_another_site_in_the_same_browser_is_refused(browsers, served:
         foreign.shutdown()
     assert len(served.server.get_clients()) == 1
     assert not problems
+
+
+def refuse(words: str) -> None:
+    raise BenchError(words)
 
 
 def _is_number(text: str) -> bool:

@@ -3,18 +3,17 @@
 import socket
 import threading
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from live_page import Served, free_port, session_of, wait_for
-from wbc_bench.controller import ControllerInfo, JointCommand
+from live_page import Served, crafting, free_port, session_of, wait_for
 from wbc_bench.episodes.single import episode_of
 from wbc_bench.errors import BenchError, SourceError, UnknownNameError
-from wbc_bench.evaluation.control_loop import ControlLoop
 from wbc_bench.results.tracking import STOOD
 from wbc_bench.sources.slew import Limits
-from wbc_bench.viewer.panel import _number
 from wbc_bench.viewer.session import Session
 
 AWAY = np.array([0.06, -0.08, 0.04])  # [m] from the hand, within reach of the arm
@@ -163,65 +162,91 @@ def test_a_scene_is_drawn_with_what_surrounds_the_robot() -> None:
         }
 
 
-class Stumbles:
-    """Holds, and raises at one control step."""
+FAILS = """
+import numpy as np
+from wbc_bench.controller import ControllerInfo, JointCommand
 
-    def __init__(self, robot) -> None:
+class Mine:
+    def __init__(self, robot):
         self.info = ControllerInfo("stumbles", frozenset(), 0.02, "this test")
-        self._q, self.steps = robot.default_q, 0
+        self.q = robot.default_q
 
-    def reset(self, episodes, obs, target) -> None:
-        self.steps = 0
+    def reset(self, episodes, obs, target):
+        self.step = 0
+        assert METHOD != "reset", "a mistake of its author"
 
-    def act(self, obs, target) -> JointCommand:
-        self.steps += 1
-        if self.steps == 10:
-            raise ZeroDivisionError("a mistake of its author")
-        return JointCommand(np.tile(self._q, (len(obs.active), 1)))
+    def act(self, obs, target):
+        self.step += 1
+        assert METHOD != "act" or self.step < 10, "a mistake of its author"
+        return JointCommand(np.tile(self.q, (len(obs.active), 1)))
+"""
 
 
-def test_a_controller_that_raises_pauses_the_page_which_says_why(served: Served) -> None:
-    view, session = served.view, served.session
-    view.ask(lambda: setattr(session, "_loop", loop))
-    loop = ControlLoop(Stumbles(session.robot), session.protocol, session._row)
-    loop.reset(session._target())
-    view.ask(lambda: None)
-    wait_for(lambda: view.paused, 20, "it is paused")
-    said = view.panel._message.content
-    assert "a mistake of its author" in said and "control step 9" in said
-    view.ask(view.restart)
+@pytest.mark.parametrize(("method", "step"), [("act", 9), ("reset", 0)])
+def test_a_controller_that_raises_pauses_the_page_which_says_why(
+    served: Served, tmp_path: Path, method: str, step: int
+) -> None:
+    view, session, panel = served.view, served.session, served.view.panel
+    file = tmp_path / f"fails_in_{method}.py"
+    file.write_text(f"METHOD = {method!r}\n{FAILS}")
+
+    def says_why() -> bool:
+        words = panel._message.content.replace("\\", "")
+        return panel._message.visible and f"failed in `{method}` at control step {step} of" in words
+
+    view.ask(lambda: view.restart(f"{file}:Mine"))
+    wait_for(lambda: view.paused and says_why(), 60, "it is paused, and says why")
+    assert "a mistake of its author" in panel._message.content
+    done = threading.Event()
+    view.ask(view._goal_moved)  # a drag that goes on
+    view.ask(done.set)
+    assert done.wait(20)
+    wait_for(lambda: view.paused and says_why(), 20, "it still says why")
+    view.ask(panel._toggle)
+    wait_for(lambda: view.paused and says_why(), 20, "it was tried again")
+    view.ask(lambda: view.restart("hold"))
     view.ask(lambda: setattr(view, "paused", False))
-    wait_for(lambda: session.moment.time > 0.3, 20, "it goes on with another controller")
+    wait_for(lambda: session.moment.time > 0.3, 60, "it goes on with another controller")
+    assert not panel._message.visible
 
 
-def test_what_a_page_sends_is_checked_against_what_it_offers(served: Served, tmp_path) -> None:
-    """A crafted message is one line in the page: nothing is imported, and the time goes on."""
+def test_what_a_page_sends_is_checked_against_what_it_offers(served: Served, tmp_path: Path) -> None:
+    """A crafted message is one line in the page: nothing is imported, and time goes on."""
     view, session, panel = served.view, served.session, served.view.panel
     trap = tmp_path / "trap.py"
     trap.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    with crafting(served) as send:
 
-    def says(words: str) -> None:
-        wait_for(lambda: words in panel._message.content and panel._message.visible, 20, words)
+        def sets(control: Any, value: Any, words: str) -> None:
+            view.ask(lambda: None)  # what was said before is gone
+            wait_for(lambda: not panel._message.visible, 20, "it says nothing")
+            send("GuiUpdateMessage", uuid=control._impl.uuid, updates={"value": value})
+            wait_for(lambda: words in panel._message.content and panel._message.visible, 20, words)
 
-    panel._spec.value = f"{trap}:make"
-    view.ask(panel._choose)
-    says("unknown choice")
-    assert not (tmp_path / "ran").exists() and panel._spec.value == session.spec == "ik"
-    for speed in (0.0, float("nan"), float("inf"), 1e9, "fast"):
-        view.ask(lambda speed=speed: view.set_speed(_number(speed)))
-        says("valid: 0.1 to 2" if speed != "fast" else "not a number")
-    panel._rpy.value = (float("inf"), 0.0, 0.0)
-    view.ask(panel._typed)
-    says("six finite numbers")
-    view.gizmo.position = (float("nan"), 0.0, 0.0)
-    view.ask(view._goal_moved)
-    says("no pose within 10 m")
-    view.gizmo._impl.position = np.zeros(2)  # as a crafted message writes it
-    view.ask(lambda: None)
-    view.ask(view._goal_moved)
-    wait_for(lambda: len(view.gizmo.position) == 3, 20, "it is at the hand again")
-    view.ask(lambda: panel._push("up"))
-    says("unknown choice 'up'")
+        sets(panel._spec, f"{trap}:make", "unknown choice")
+        assert not (tmp_path / "ran").exists() and panel._spec.value == session.spec == "ik"
+        sets(panel._source, f"{tmp_path}/script.toml", "unknown choice")
+        assert panel._source.value == "live"
+        for speed in (0.0, np.nan, np.inf, 1e9):
+            sets(panel._speed, speed, f"speed {speed:g}, valid: 0.1 to 2")
+            wait_for(lambda: panel._speed.value == served.view.speed == 1.0, 20, "the slider is back")
+        sets(panel._rpy, [np.inf, 0.0, 0.0], "six finite numbers")
+        sets(panel._pos, [1e300, 0.0, 0.0], "no pose within 10 m")
+        send("GuiUpdateMessage", uuid=panel._push_speed._impl.uuid, updates={"value": 50.0})
+        sets(panel._pushes, "forward", "a push of 50 m/s, valid: 0.1 to 1")
+        sets(panel._pushes, "up", "unknown choice 'up'")
+        owner = served.server.scene._owner_id
+        for position in ([np.nan, 0.0, 0.0], [0.0, 0.0]):
+            sets(panel._pushes, "up", "unknown choice 'up'")
+            pose = {"position": position, "wxyz": [np.inf, 0.0, 0.0, 0.0]}
+            send("TransformControlsUpdateMessage", name="/goal", owner=owner, **pose)
+            wait_for(lambda: "no pose within 10 m" in panel._message.content, 20, "it is refused")
+            wait_for(lambda: len(view.gizmo.position) == 3, 20, "the gizmo is at the hand again")
+            assert np.isfinite([*view.gizmo.position, *view.gizmo.wxyz]).all()
+        # of a control only its value: viser would take its label, or whom it tells, from anybody
+        for name in ("props", "sync_cb", "update_cb", "removed"):
+            send("GuiUpdateMessage", uuid=panel._speed._impl.uuid, updates={name: 5})
+        sets(panel._speed, 7.0, "speed 7, valid: 0.1 to 2")
     before = session.moment.time
     wait_for(lambda: session.moment.time > before + 0.1, 20, "time goes on")
 
@@ -236,3 +261,20 @@ def test_a_port_that_is_taken_is_refused() -> None:
         port = taken.getsockname()[1]
         with pytest.raises(BenchError, match=f"port {port} is in use"):
             serve("127.0.0.1", port, session_of("hold", "live"), print)
+
+
+@pytest.mark.parametrize(("choice", "seconds"), [("retreat", 5.0), ("hold", np.inf)])
+def test_what_a_silent_stream_does_is_an_option_of_the_page_too(monkeypatch, choice, seconds) -> None:
+    from wbc_bench.cli.main import main
+    from wbc_bench.sources.live import LiveSource
+
+    made = []
+
+    def load_source(name, protocol, config):
+        made.append((name, config.retreat_after))
+        return LiveSource()
+
+    monkeypatch.setattr("wbc_bench.viewer.session.load_source", load_source)
+    monkeypatch.setattr("wbc_bench.viewer.live.serve", lambda host, port, session, ready: session.close())
+    main(["live", "--controller", "hold", "--source", "stream", "--on-silence", choice])
+    assert made == [("stream", seconds)]

@@ -122,13 +122,13 @@ def _end_output() -> None:
 
 
 def drawing() -> None:
-    """Before anything is drawn: MuJoCo loads the library that MUJOCO_GL names when it is imported.
+    """Before MuJoCo is used: it loads the library that MUJOCO_GL names when it is imported.
 
     Raises: UsageError, it cannot.
     """
     try:
         import mujoco  # noqa: F401
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, RuntimeError) as error:  # the last of a name it does not know
         chosen = os.environ.get("MUJOCO_GL", "")
         raise UsageError(
             f"MuJoCo cannot draw with MUJOCO_GL={chosen} ({error}): install it or unset that"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from wbc_bench.cli.common import NO_RECORDS, RESULTS, print_table
+from wbc_bench.cli.common import NO_RECORDS, RESULTS, UsageError, print_table
 from wbc_bench.errors import UnknownNameError
 
 if TYPE_CHECKING:
@@ -55,11 +55,14 @@ class List:
 def _inputs() -> "Iterator[Table]":
     from importlib.metadata import entry_points
 
+    from wbc_bench.isolation import blamed
     from wbc_bench.results.table import Table
 
     for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
         header = ("Vector", "Columns", "Size", "Term", "Unit")
-        yield Table(point.name, f"Inputs of {point.name}", header, tuple(point.load()()))
+        with blamed(f"inputs of '{point.name}' cannot be listed"):
+            rows = tuple(point.load()())
+        yield Table(point.name, f"Inputs of {point.name}", header, rows)
 
 
 def _controllers(runs: "list[Run]") -> "Table":
@@ -78,15 +81,14 @@ def _controllers(runs: "list[Run]") -> "Table":
 
 
 def _variants(point: "EntryPoint") -> list[tuple[str, str]]:
-    """(variant, description) of an installed factory; of one that fails, what is wrong with it."""
-    from wbc_bench.controller import HasVariants
-    from wbc_bench.errors import fault_of
+    """(variant, description) of an installed controller; of one that fails, what is wrong with it."""
+    from wbc_bench.errors import BenchError
+    from wbc_bench.registry import variants_of
 
     try:
-        factory = point.load()
-        return factory.variants() if isinstance(factory, HasVariants) else [("", "")]
-    except Exception as error:  # somebody else's code: the others are still listed
-        return [("", f"cannot be loaded: {fault_of(error)}")]
+        return variants_of(point)
+    except BenchError as error:  # somebody else's code: the others are still listed
+        return [("", f"cannot be loaded: {error}")]
 
 
 def _success(runs: "list[Run]", spec: str) -> str:
@@ -102,14 +104,14 @@ def _success(runs: "list[Run]", spec: str) -> str:
 
 def _met_by(record: "RunRecord") -> str:
     """Spec of the controller that met the replicate of a run."""
-    from wbc_bench.errors import ControllerError
+    from wbc_bench.errors import BenchError
     from wbc_bench.registry import spec_of_replicate
 
     if record.resolved_controller is not None:
         return record.resolved_controller
     try:
         return spec_of_replicate(record.controller, record.replicate)
-    except ControllerError:  # its package cannot be imported here
+    except BenchError:  # its package cannot be imported here, or fails
         return record.controller
 
 
@@ -222,18 +224,31 @@ class ExportController:
     def run(self) -> None:
         from wbc_bench.controller import Exportable
         from wbc_bench.episodes.protocol import find_protocol
-        from wbc_bench.files import ensure_writable, folder_name
+        from wbc_bench.errors import ControllerError
+        from wbc_bench.files import ensure_writable, folder_name, scratch_folder
+        from wbc_bench.isolation import blamed
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
 
         robot = load_robot(find_protocol(self.protocol)[0].robot)
         controller = load_controller(self.controller, robot)
-        formats = controller.formats if isinstance(controller, Exportable) else ()
+        failed = f"controller '{self.controller}' failed in `export`"
+        with blamed(failed):
+            formats = tuple(controller.formats) if isinstance(controller, Exportable) else ()
         if not isinstance(controller, Exportable) or self.format not in formats:
             raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
         path = self.out or Path(f"{folder_name(self.controller)}.{self.format}")
+        if path.is_dir():
+            raise UsageError(f"--out {path}: a folder, valid: a file")
         ensure_writable(path.parent)
-        controller.export(path, self.format)
+        with scratch_folder(path.parent) as folder:  # one that fails half-way leaves what was there
+            with blamed(failed):
+                controller.export(folder / path.name, self.format)
+            made = [file.name for file in folder.iterdir()]
+            if path.name not in made:
+                raise ControllerError(f"{failed}: it wrote no file '{path.name}'")
+            for name in made:
+                (folder / name).replace(path.with_name(name))
         print(path)
 
 
@@ -250,6 +265,7 @@ class Bench:
         from importlib.metadata import entry_points
 
         from wbc_bench.files import ensure_writable
+        from wbc_bench.isolation import blamed
         from wbc_bench.results.table import Table
 
         found = {point.name: point for point in entry_points(group=BENCHMARKS)}
@@ -259,7 +275,8 @@ class Bench:
         if self.out:
             ensure_writable(self.out)
         for name in self.names or sorted(found):
-            frame = found[name].load()()
+            with blamed(f"benchmark '{name}' failed"):
+                frame = found[name].load()()
             cells = [
                 tuple(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) for row in frame.values
             ]

@@ -51,6 +51,7 @@ class Replay(_Again):
     """Path of the page to write, FILE.html; the page needs no network."""
 
     def run(self) -> None:
+        drawing()
         from wbc_bench.progress import Progress
         from wbc_bench.viewer.replay import write_html
 

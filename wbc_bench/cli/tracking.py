@@ -13,7 +13,10 @@ from wbc_bench.errors import UnknownNameError
 
 if TYPE_CHECKING:
     from wbc_bench.results.tracking import Tracked
-from wbc_bench.cli.common import RESULTS, UsageError, check_port, host, not_negative, print_table
+    from wbc_bench.sources.stream_filter import StreamConfig
+from wbc_bench.cli.common import RESULTS, UsageError, check_port, drawing, host, not_negative, print_table
+
+Silence = Literal["retreat", "hold"]
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class Track:
     of ablation_v1)."""
     address: str = "tcp://127.0.0.1:5601"
     """ZeroMQ address at which a stream listens."""
-    on_silence: Literal["retreat", "hold"] = "retreat"
+    on_silence: Silence = "retreat"
     """What the target of a stream does after 5 s without an accepted message: go back to where the hand was
     at the start, or stay where it is in the world."""
     port: int = 8080
@@ -46,6 +49,7 @@ class Track:
     """Folder to write records, table and figure to."""
 
     def run(self) -> None:
+        drawing()
         from wbc_bench.episodes.single import CONDITIONS
         from wbc_bench.files import ensure_writable
         from wbc_bench.publish import publish_tracks
@@ -83,12 +87,9 @@ class Track:
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
         from wbc_bench.sources.registry import load_source
-        from wbc_bench.sources.stream_filter import StreamConfig
 
         controller = load_controller(spec, load_robot())
-        stream = StreamConfig()
-        if self.on_silence == "hold":
-            stream = stream._replace(retreat_after=math.inf)
+        stream = _stream(self.on_silence)
         source = load_source(name, self.address, self.allow_remote, door_protocol(self.seed), stream)
         if self.allow_remote and source.live:
             print(f"listening on {self.address}: whoever can send there moves the robot", file=sys.stderr)
@@ -136,12 +137,16 @@ class Live:
     protocol)."""
     seed: int = 0
     """Seed of the draws of a randomised episode."""
+    on_silence: Silence = "retreat"
+    """What the target of a stream does after 5 s without an accepted message: go back to where the hand was
+    at the start, or stay where it is in the world."""
     port: int = 8080
     """TCP port of the page, 1 to 65535."""
     allow_remote: FlagCreatePairsOff[bool] = False
     """Let other machines open the page, and move the robot."""
 
     def run(self) -> None:
+        drawing()
         from wbc_bench.episodes.single import LONGEST, free_episode
         from wbc_bench.viewer.live import serve
         from wbc_bench.viewer.session import Session
@@ -149,7 +154,7 @@ class Live:
         check_port(self.port)
         not_negative("--seed", self.seed)
         episode = free_episode(self.protocol, self.condition, self.seed, LONGEST)
-        session = Session(self.controller, self.source, *episode)
+        session = Session(self.controller, self.source, *episode, _stream(self.on_silence))
 
         def ready(url: str) -> None:
             print(f"{url}  (Ctrl-C ends it)", flush=True)
@@ -158,3 +163,10 @@ class Live:
             serve(host(self.allow_remote), self.port, session, ready)
         except KeyboardInterrupt:
             print()
+
+
+def _stream(on_silence: Silence) -> "StreamConfig":
+    """What a stream does, with the option for its silence."""
+    from wbc_bench.sources.stream_filter import StreamConfig
+
+    return StreamConfig(retreat_after=math.inf) if on_silence == "hold" else StreamConfig()

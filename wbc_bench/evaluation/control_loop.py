@@ -1,7 +1,7 @@
 """A shard of episodes under one controller, a control step at a time."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from wbc_bench.controller import Controller, JointCommand, ProtocolAware, Target, UsesRandomness
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.errors import BenchError, ControllerError, fault_of
+from wbc_bench.errors import ControllerError
 from wbc_bench.evaluation.delays import LateStates, physics_steps
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation, State
-from wbc_bench.isolation import GlobalRandomness
+from wbc_bench.isolation import GlobalRandomness, blamed
 from wbc_bench.outcomes import Outcome
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, Scene
@@ -115,41 +115,46 @@ class ControlLoop:
                 f"controller '{self._controller.info.name}' returned {type(command).__name__} from `act`, "
                 "valid: a wbc_bench.controller.JointCommand"
             )
-        q = np.asarray(command.q)
-        if q.shape != (len(active), NUM_JOINTS):
-            raise ControllerError(
-                f"controller '{self._controller.info.name}' returned commands of shape {q.shape}, "
-                f"expected ({len(active)}, {NUM_JOINTS})"
-            )
+        q = self._array("commands", command.q, "iuf", (len(active), NUM_JOINTS))
+        infeasible = command.infeasible
+        if infeasible is not None:
+            infeasible = self._array("`infeasible`", infeasible, "b", (len(active),))
         finite = np.isfinite(q).all(axis=1)
         self.ended[active & ~finite] = Outcome.INVALID
         active &= finite
-        result = StepResult(active.copy(), q, command.infeasible)
+        result = StepResult(active.copy(), q, infeasible)
         if active.any():
             self._move(q, active)
         return result
 
-    @contextmanager
-    def blamed(self, method: str) -> Iterator[None]:
-        """Where the controller's code runs: global random streams are its own, its faults one line.
+    def blamed(self, method: str) -> AbstractContextManager[None]:
+        """Where a method of the controller runs; see `isolation.blamed`."""
+        episodes = self._rows.episode
+        doing = (
+            f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "
+            f"of episodes {episodes.min()} to {episodes.max()}"
+        )
+        return blamed(doing, self._randomness)
 
-        What it raises, `SystemExit` too, comes back with its own frames, step and episodes.
-        """
+    def _array(self, what: str, given: object, kinds: str, shape: tuple[int, ...]) -> NDArray:
+        """A part of a command. Raises: ControllerError, its shape or NumPy's kind of its values is wrong."""
         try:
-            with self._randomness.own():
-                yield
-        except BenchError:
-            raise
-        except BaseException as error:
-            episodes = self._rows.episode
-            said = (
-                f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "
-                f"of episodes {episodes.min()} to {episodes.max()}: {fault_of(error)}"
+            with self.blamed("act"):  # an object may have its own way to become an array
+                found = np.asarray(given)
+        except ControllerError as error:
+            raise ControllerError(f"{error}; {what} are no array, expected {shape}") from error
+        name, valid = self._controller.info.name, "booleans" if kinds == "b" else "real numbers"
+        if found.dtype.kind not in kinds:
+            odd = next(iter(found.flat), None)
+            raise ControllerError(
+                f"controller '{name}' returned {what} of type {found.dtype}, e.g. {ascii(odd)[:80]}, "
+                f"at control step {self.step}, valid: {valid}"
             )
-            if isinstance(error, KeyboardInterrupt):  # of the user, or of the controller: a worker knows
-                error.add_note(said)
-                raise
-            raise ControllerError(said) from error
+        if found.shape != shape:
+            raise ControllerError(
+                f"controller '{name}' returned {what} of shape {found.shape}, expected {shape}"
+            )
+        return found
 
     def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_]) -> None:
         pushed = self.push_step == self.step

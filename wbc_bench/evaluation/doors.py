@@ -22,6 +22,7 @@ from wbc_bench.robot import load_robot
 from wbc_bench.sources.diffusion.demonstrations import Demonstration, write_demonstrations
 from wbc_bench.sources.diffusion.expert import ExpertSource
 from wbc_bench.sources.diffusion.scene import CLOSED, Door, draw_door
+from wbc_bench.sources.diffusion.zarr_archive import MAX_ROWS
 from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.registry import find_policy, recorded_name
 from wbc_bench.sources.slew import Pose
@@ -77,15 +78,19 @@ def record(
 
     The file depends neither on `workers` nor on when it is written.
 
-    Raises: SourceError when no door was closed; ControllerError, StoreError.
+    Raises: SourceError when no door was closed, or a file could not hold all; ControllerError, StoreError.
     """
+    period = episode_of(DURATION, seed, "nominal")[0].control_period
+    most = int(MAX_ROWS / round(DURATION / period))
+    if count > most:
+        raise SourceError(f"{count} episodes to record, valid: at most {most}, of {MAX_ROWS} steps in all")
     load_controller(spec, load_robot())
     episodes = list(_run_all(None, spec, "nominal", seed, count, workers, progress))
     kept = [episode for episode in episodes if episode.success]
     if not kept:
         raise SourceError(f"'{spec}' closed none of {count} doors of seed {seed}: nothing to write")
     attributes = {
-        "control_period": episode_of(DURATION, seed, "nominal")[0].control_period,
+        "control_period": period,
         "controller": spec,
         "seed": seed,
         "episodes_asked": count,

@@ -39,7 +39,7 @@ def track(
     Raises:
         UnknownNameError: no such condition.
         SourceError: a duration that is not positive, or a run that says nothing of the controller: no message
-            came, or fewer than MIN_USED of them were accepted.
+            came, or fewer than MIN_USED of those of a known clock were accepted.
         ControllerError: see `ControlLoop`.
     """
     if condition not in CONDITIONS:
@@ -54,10 +54,12 @@ def track(
 
 def _check_used(counts: Mapping[str, int]) -> None:
     """Refuse to score the target that stood still because its messages were refused."""
-    if counts and counts[MessageStatus.ACCEPTED] < max(MIN_USED * sum(counts.values()), 1):
+    # what waited for its reader, or came before its clock was known, says nothing of the run
+    judged = sum(counts.values()) - counts.get(MessageStatus.CLOCK_UNKNOWN, 0)
+    if counts and counts[MessageStatus.ACCEPTED] < max(MIN_USED * judged, 1):
         raise SourceError(
             f"{counters_text(counts)}; valid: at least one message and {MIN_USED:.0%} of all accepted, "
-            "a run of fewer is not scored"
+            "less those of an unknown clock; a run of fewer is not scored"
         )
 
 

@@ -85,10 +85,14 @@ def _work(task: Task) -> Result:
 
 
 def _work_apart(task: Task) -> Result:
-    """One shard, on a worker of this machine."""
+    """One shard, in a process of its own.
+
+    No interrupt of the user arrives there: processes of loky ignore them, and dask calls this on a thread
+    that is not the main one.
+    """
     try:
         return _work(task)
-    except KeyboardInterrupt as error:  # interrupts are the client's: this one was raised by somebody's code
+    except KeyboardInterrupt as error:  # raised by somebody's code
         name = task.controller if isinstance(task.controller, str) else "handed over"
         said = getattr(error, "__notes__", None) or [f"controller '{name}' raised {fault_of(error)}"]
         raise ControllerError(said[-1]) from None
@@ -140,7 +144,7 @@ def _on_dask(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
         queue = iter(tasks)
         # A window instead of everything at once: rows travel when they are needed.
         window = 2 * max(len(client.scheduler_info()["workers"]), engine.workers)
-        futures = as_completed(client.submit(_work, task, pure=False) for task in islice(queue, window))
+        futures = as_completed(client.submit(_work_apart, task, pure=False) for task in islice(queue, window))
         for future in futures:
             try:
                 yield future.result()
@@ -148,4 +152,4 @@ def _on_dask(tasks: Iterable[Task], engine: Engine) -> Iterator[Result]:
                 raise ExecutionError(
                     f"dask gave up on a shard that killed its workers: {error}; finished shards are kept"
                 ) from error
-            futures.update(client.submit(_work, task, pure=False) for task in islice(queue, 1))
+            futures.update(client.submit(_work_apart, task, pure=False) for task in islice(queue, 1))

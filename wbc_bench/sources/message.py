@@ -27,6 +27,7 @@ class MessageStatus(enum.StrEnum):
     NOT_UNIT = "not_unit"  # a quaternion of another length than 1
     LATE = "late"  # sent too long ago
     EARLY = "early"  # sent in the future, as far as the sender's clock is known
+    CLOCK_UNKNOWN = "clock_unknown"  # sent by another clock, of which too little has been seen yet
     REPLAYED = "replayed"  # a sequence number, or a session, that has been before
     OCCUPIED = "occupied"  # another session is being followed
     FAR = "far"  # too far from the robot, from where the target is, or from the origin

@@ -3,6 +3,7 @@
 One thread steps and draws; what a person does in the page arrives on other threads and waits in a queue.
 """
 
+import contextlib
 import time as clocks
 from collections import deque
 from collections.abc import Callable
@@ -33,6 +34,7 @@ class LiveView:
         self.session = session
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self.paused, self.waiting, self.speed = False, False, 1.0
+        self._fault = ""  # of the controller or the source at the last step
         self.scene = SceneView(server, session.robot, session.protocol.success, TRAIL_PIECES)
         self._server = server
         self._place_gizmo()
@@ -110,9 +112,12 @@ class LiveView:
         try:
             self.session.step()
         except BenchError as error:
-            self.paused = True
-            self.panel.say(str(error))
+            self.paused, self._fault = True, str(error)
+            self.panel.say(self._fault)
             return
+        if self._fault:
+            self._fault = ""
+            self.panel.say("")
         self._pace.append((clocks.monotonic(), self.session.moment.time))
         self.panel.record(self.session.moment)
 
@@ -127,14 +132,16 @@ class LiveView:
                 command = self._commands.get_nowait()
             except Empty:
                 return
+            mistake = ""
             try:
-                self.panel.say("")
                 command()
             except BenchError as error:
-                self.panel.say(str(error))
+                mistake = str(error)
+            self.panel.say(mistake or self._fault)
 
     def _begin(self) -> None:
         self._pace.clear()
+        self._fault = ""
         self.scene.clear()
         if self._surroundings is not self.session.surroundings:
             self._surroundings = self.session.surroundings
@@ -161,15 +168,15 @@ class LiveView:
         self.gizmo.on_update(lambda _: self.ask(self._goal_moved))
 
     def _goal_moved(self) -> None:
-        try:
+        pos_w, wxyz = np.full(3, np.nan), np.zeros(4)
+        with contextlib.suppress(TypeError, ValueError):  # what arrived is not numbers
             pos_w, wxyz = np.array(self.gizmo.position, float), np.array(self.gizmo.wxyz, float)
-            turned = wxyz / np.linalg.norm(wxyz)
-            sound = pos_w.shape == (3,) and wxyz.shape == (4,) and bool(np.isfinite(turned).all())
-        except (TypeError, ValueError):
-            pos_w, turned, sound = np.zeros(3), np.zeros(4), False
-        if not sound or not (np.abs(pos_w) <= FARTHEST).all():  # not so of NaN either
+        length = float(np.linalg.norm(wxyz))
+        shapes = pos_w.shape == (3,) and wxyz.shape == (4,)
+        if not (shapes and (np.abs(pos_w) <= FARTHEST).all() and 0.5 < length < 2):  # not so of NaN either
             self._place_gizmo()
             raise BenchError(f"a goal that is no pose within {FARTHEST:g} m")
+        turned = wxyz / length
         self.session.set_goal(pos_w, turned)
         if self.waiting:
             self.paused = self.waiting = False

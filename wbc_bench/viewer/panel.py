@@ -1,5 +1,6 @@
 """What stands beside the scene of the live view: read-outs, charts and controls."""
 
+import re
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
@@ -17,7 +18,7 @@ from wbc_bench.viewer.session import Session
 CHART_SECONDS, CHART_EVERY = 10.0, 5  # [s], control steps a point
 POSITION_COLOUR, ORIENTATION_COLOUR = "#2864c8", "#b0446e"
 SPEEDS = (0.1, 2.0)  # simulated by elapsed time
-PUSH_SPEEDS = (0.1, 1.0)  # [m/s]
+PUSH_SPEEDS, PUSH_SPEED = (0.1, 1.0), 0.3  # [m/s]
 PUSHES = {"forward": (1, 0), "back": (-1, 0), "left": (0, 1), "right": (0, -1)}  # world x, y
 
 
@@ -79,8 +80,8 @@ class Panel:
             self._rpy = gui.add_vector3("r p y [deg]", (0.0, 0.0, 0.0), step=1.0)
         with gui.add_folder("Push"):
             low, high = PUSH_SPEEDS
-            self._push_speed = gui.add_slider("m/s", min=low, max=high, step=0.1, initial_value=0.3)
-            pushes = gui.add_button_group("Direction", tuple(PUSHES))
+            self._push_speed = gui.add_slider("m/s", min=low, max=high, step=0.1, initial_value=PUSH_SPEED)
+            self._pushes = gui.add_button_group("Direction", tuple(PUSHES))
         with gui.add_folder("Who and what"):
             self._specs = {name: name for name in sorted({*controllers(), session.spec})}
             self._spec = gui.add_dropdown("Controller", [*self._specs], initial_value=session.spec)
@@ -94,13 +95,13 @@ class Panel:
         self._pause.on_click(lambda _: view.ask(self._toggle))
         times = {"single step": view.step_once, "reset": view.restart}
         steps.on_click(lambda event: view.ask(lambda: _chosen("Time", event.target.value, times)()))
-        self._speed.on_update(lambda _: view.ask(lambda: view.set_speed(_number(self._speed.value))))
-        pushes.on_click(lambda event: view.ask(lambda: self._push(event.target.value)))
+        self._pushes.on_click(lambda event: view.ask(lambda: self._push(event.target.value)))
         # what the program itself writes into a field has no client
         for field in (self._pos, self._rpy):
             field.on_update(lambda event: view.ask(self._typed) if event.client else None)
         for field in (self._spec, self._source):
             field.on_update(lambda event: view.ask(self._choose) if event.client else None)
+        self._speed.on_update(lambda event: view.ask(self._set_speed) if event.client else None)
 
     def begin(self) -> None:
         """A new episode."""
@@ -141,15 +142,24 @@ class Panel:
 
     def say(self, text: str) -> None:
         """One line about what went wrong, or nothing."""
-        self._message.content, self._message.visible = f"⚠ {text}", bool(text)
+        # the page shows Markdown, and HTML inside it; these words may be anybody's, e.g. of an exception
+        plain = re.sub(r"[\\`*_~<&\[{]", r"\\\g<0>", text)
+        self._message.content, self._message.visible = f"⚠ {plain}", bool(text)
 
     def _toggle(self) -> None:
         self._view.paused = not self._view.paused
         self.update(float("nan"))
 
+    def _set_speed(self) -> None:
+        try:
+            self._view.set_speed(_number(self._speed.value))
+        finally:
+            self._speed.value = self._view.speed
+
     def _push(self, direction: str) -> None:
         speed, (low, high) = _number(self._push_speed.value), PUSH_SPEEDS
-        if not low <= speed <= high:
+        if not low <= speed <= high:  # not so of NaN either
+            self._push_speed.value = PUSH_SPEED
             raise BenchError(f"a push of {speed:g} m/s, valid: {low:g} to {high:g}")
         self._view.session.push(np.array(_chosen("Direction", direction, PUSHES)) * speed)
 

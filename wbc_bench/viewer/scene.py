@@ -14,7 +14,7 @@ from wbc_bench.episodes.protocol import Success
 from wbc_bench.errors import BenchError, missing_extra
 from wbc_bench.robot import Robot, Scene
 from wbc_bench.rotations import wxyz_from_matrix
-from wbc_bench.viewer.guard import Guard, guarded
+from wbc_bench.viewer.guard import Guard, accept_values_only, check_guarded, guarded
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ def serving(host: str = "127.0.0.1", port: int = 8080, guard: Guard | None = Non
 
     It answers only whom the guard lets through; without one it is for nobody but this process.
 
-    Raises: BenchError when viser is missing or cannot listen.
+    Raises: BenchError when viser is missing, cannot listen or lets in everybody.
     """
     try:
         import viser
@@ -51,6 +51,8 @@ def serving(host: str = "127.0.0.1", port: int = 8080, guard: Guard | None = Non
         except OSError as error:
             raise BenchError(f"cannot listen on {host}, port {port}: {error}") from error
     try:
+        check_guarded(host, server.get_port())
+        accept_values_only(server)
         yield server
     finally:
         with redirect_stdout(io.StringIO()):

@@ -15,18 +15,28 @@ from wbc_bench.rotations import wxyz_from_matrix
 from wbc_bench.sources import Source, StampedTarget, load_source, to_world
 from wbc_bench.sources.interface import SceneSource
 from wbc_bench.sources.live import LiveSource
+from wbc_bench.sources.stream_filter import StreamConfig
 from wbc_bench.viewer.moment import PUSH_SECONDS, Array, Moment, moment_of
 
 
 class Session:
     """Steps a robot for as long as it stands; `moment` is the present one."""
 
-    def __init__(self, spec: str, source: str, protocol: EvalProtocol, row: EpisodeManifest) -> None:
+    def __init__(
+        self,
+        spec: str,
+        source: str,
+        protocol: EvalProtocol,
+        row: EpisodeManifest,
+        stream: StreamConfig = StreamConfig(),  # noqa: B008  (immutable)
+    ) -> None:
         """An episode (a manifest of one row, whose target nobody looks at); see `track.free_episode`.
+
+        `stream` is that of a source which is one.
 
         Raises: BenchError, whatever of these is unknown or cannot be loaded.
         """
-        self.protocol, self._row = protocol, row
+        self.protocol, self._row, self._stream = protocol, row, stream
         self.robot: Robot = load_robot(protocol.robot)
         self.spec, self.source_name = spec, source
         self.controller: Controller = load_controller(spec, self.robot)
@@ -45,6 +55,10 @@ class Session:
         surroundings = following.scene if isinstance(following, SceneSource) else None
         try:
             loop = ControlLoop(controller, self.protocol, self._row, surroundings)
+            seen = seen_of(loop.state, self.robot)
+            _look(following, loop)
+            following.reset(seen)
+            aim = to_world(following.target(0.0, seen), seen)
         except BenchError:
             if changed:
                 following.close()
@@ -56,11 +70,8 @@ class Session:
         self.surroundings = surroundings
         self._series = Series(self.period)
         self._push, self._pushed = np.zeros(2), -np.inf  # [m/s], [s]
-        self._look()
-        self._seen = seen_of(loop.state, self.robot)
-        self.source.reset(self._seen)
-        self._aim()
-        loop.reset(self._target())
+        self._seen, (self._pos_w, self._rot_w) = seen, aim
+        self._take(0.0)
 
     @property
     def period(self) -> float:
@@ -103,27 +114,28 @@ class Session:
         self._push, self._pushed = velocity_w, self.moment.time
 
     def step(self) -> None:
-        """One control step towards the target of the source; nothing when it is over."""
+        """One control step towards the target of the source; nothing when it is over.
+
+        Raises: BenchError when the controller or the source fails; another step is another try.
+        """
         if not self.running:
             return
+        if self._loop.step == 0:  # not in `restart`: a controller may fail at this as at any step
+            self._loop.reset(self._target())
         if self._loop.advance(self._target()).stepped.any():
             self._series.add(self._pos_w, self._rot_w, self._seen.ee_pos_w, self._seen.ee_rot_w)
         self._seen = seen_of(self._loop.state, self.robot)
-        self._look()
-        self._aim()
+        _look(self.source, self._loop)
+        time = self._loop.step * self.period
+        self._pos_w, self._rot_w = to_world(self.source.target(time, self._seen), self._seen)
+        self._take(time)
 
     def close(self) -> None:
         """Let go of what the source holds."""
         self.source.close()
 
-    def _look(self) -> None:
-        if isinstance(self.source, SceneSource):
-            self.source.look(self._loop.simulation.scenery[0])
-
-    def _aim(self) -> None:
-        """Ask the source, and see what there is now."""
-        time = self._loop.step * self.period
-        self._pos_w, self._rot_w = to_world(self.source.target(time, self._seen), self._seen)
+    def _take(self, time: float) -> None:
+        """Keep what there is now, `time` [s] after the start."""
         push = self._push if time - self._pushed <= PUSH_SECONDS else np.zeros(2)
         self.moment: Moment = moment_of(self._loop, 0, self._pos_w, self._rot_w, push)
 
@@ -131,7 +143,13 @@ class Session:
         return self._loop.target(self._pos_w[None], self._rot_w[None])
 
     def _load(self, name: str) -> Source:
-        return load_source(name, protocol=self.protocol)
+        return load_source(name, protocol=self.protocol, config=self._stream)
+
+
+def _look(source: Source, loop: ControlLoop) -> None:
+    """Show a source the scene, if it looks at one."""
+    if isinstance(source, SceneSource):
+        source.look(loop.simulation.scenery[0])
 
 
 def hand_pose(moment: Moment) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@ import json
 import os
 import sys
 import tempfile
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,11 @@ from wbc_bench.robot import JOINT_NAMES, Robot
 Array = NDArray[np.float64]
 
 
+# PlaCo 0.10.2 never frees a wrapper, of 474 KiB, and every shard builds a controller: those whose solver is
+# gone serve again. Each serves one solver at a time, since it holds the configuration of a step.
+_IDLE: dict[str, list[placo.RobotWrapper]] = {}  # URDF -> wrappers that no solver uses
+
+
 class PlacoIK:
     """One step of differential inverse kinematics over the floating base.
 
@@ -25,7 +31,11 @@ class PlacoIK:
     """
 
     def __init__(self, robot: Robot, weights: Weights, period: float) -> None:
-        self._robot = wrapper = _load(robot)
+        urdf = robot.urdf()
+        idle = _IDLE.setdefault(urdf, [])
+        self._robot = wrapper = idle.pop() if idle else _load(urdf)
+        weakref.finalize(self, idle.append, wrapper)
+        wrapper.reset()
         margin = weights.joint_margin
         for name, lower, upper, speed in zip(
             JOINT_NAMES, robot.lower, robot.upper, robot.velocity, strict=True
@@ -105,10 +115,10 @@ class PlacoIK:
         return robot.state.q.copy()
 
 
-def _load(robot: Robot) -> placo.RobotWrapper:
+def _load(urdf: str) -> placo.RobotWrapper:
     """The robot with the pairs of parts that can meet: forearm, wrist and gripper with base and legs."""
     with tempfile.TemporaryDirectory() as folder, _quiet(Path(folder) / "log"):
-        wrapper = placo.RobotWrapper("", 0, robot.urdf())
+        wrapper = placo.RobotWrapper("", 0, urdf)
         pairs = [[arm, body] for arm in ARM_LINKS for body in BODY_LINKS]
         file = Path(folder) / "pairs.json"
         file.write_text(json.dumps(pairs))

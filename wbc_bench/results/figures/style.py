@@ -1,10 +1,12 @@
 """Colours and line styles of all figures, and how a figure is saved: equal figures give equal bytes."""
 
 from collections.abc import Iterable, Mapping
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any
 
 from matplotlib import style
+from matplotlib.colors import hsv_to_rgb, to_hex
 from matplotlib.figure import Figure
 
 from wbc_bench.outcomes import Outcome
@@ -32,6 +34,7 @@ OUTCOME_COLOURS = {
 STRATUM_COLOURS = {"arm": BLUE, "posture": ORANGE, "step": GREEN, "beyond": GREY}
 CONDITION_COLOURS = {"nominal": BLUE, "randomised": VERMILION}
 METHOD_COLOURS: tuple[str, ...] = (BLUE, VERMILION, GREEN, PINK, ORANGE, SKY, BLACK)
+GOLDEN = 0.618033988749895  # of a turn of hue: colours beyond the palette are far from their neighbours
 # noise and pushes make many lines of one: they stay behind the undisturbed
 CONDITION_LINES: dict[str, dict[str, Any]] = {
     "nominal": {"lw": 1.4, "zorder": 3},
@@ -41,7 +44,7 @@ DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # so that curves that coincide bot
 
 
 def controller_colours(names: Mapping[str, str], rows: Iterable[Row] | None = None) -> dict[str, str]:
-    """Spec -> colour. A name has the colour that a study gives it; the others share what is left in turn.
+    """Spec -> colour. A name has the colour that a study gives it, each of the others one of its own.
 
     Args:
         names: Spec -> name in the figures, of every controller of a report or a figure.
@@ -50,9 +53,10 @@ def controller_colours(names: Mapping[str, str], rows: Iterable[Row] | None = No
     rows = released_rows() if rows is None else rows
     given = {row.label: COLOURS[row.colour] for row in rows if row.colour}
     known = {name: given[name] for name in names.values() if name in given}
-    free = [colour for colour in METHOD_COLOURS if colour not in known.values()] or METHOD_COLOURS
     others = sorted(set(names.values()) - known.keys())
-    known |= {name: free[k % len(free)] for k, name in enumerate(others)}
+    more = (to_hex(tuple(hsv_to_rgb((k * GOLDEN % 1.0, 0.85, (0.75, 0.5)[k % 2])))) for k in count(1))
+    free = (each for each in chain(METHOD_COLOURS, more) if each not in known.values())
+    known |= dict(zip(others, list(islice(free, len(others))), strict=True))
     return {spec: known[name] for spec, name in names.items()}
 
 
