@@ -21,6 +21,7 @@ def _protocols() -> Path:
 
 
 PROTOCOLS = _protocols()  # released protocols, scripts and studies: a wheel holds them beside the code
+SEALED = "_sealed"  # end of the name of a protocol whose episodes are not published yet
 
 
 LONGEST_NAME = 120  # characters of a folder's name; file systems take 255 bytes, temporary names are longer

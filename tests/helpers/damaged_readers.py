@@ -33,6 +33,7 @@ from wbc_bench.episodes import ladder
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.manifest import read_manifest
 from wbc_bench.episodes.protocol import find_protocol, read_protocol
+from wbc_bench.episodes.sealed import Commitment, read_commitment
 from wbc_bench.errors import BenchError
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.results.analysis import collect_all
@@ -111,6 +112,17 @@ def read_manifests(folder: Path) -> None:
 
 def seal_manifests(folder: Path) -> None:
     (folder / "smoke_v1.sha256").write_text(f"{sha256(folder / 'smoke_v1.parquet')}  smoke_v1.parquet\n")
+
+
+def write_commitments(folder: Path) -> None:
+    commitment = Commitment(SMOKE.name, SMOKE.digest, "a" * 64, 12)
+    (folder / "smoke_v1_sealed.commitment.json").write_bytes(msgspec.json.encode(commitment))
+
+
+def read_commitments(folder: Path) -> None:
+    for path in sorted(folder.iterdir()):
+        commitment, _ = read_commitment(path)
+        assert commitment.protocol == "smoke_v1" and commitment.episodes == 12
 
 
 def write_studies(folder: Path) -> None:
@@ -366,6 +378,7 @@ def read_targets(folder: Path) -> None:
 READERS = {
     "protocol": Reader(write_protocols, read_protocols),
     "manifest": Reader(write_manifests, read_manifests, seal_manifests),
+    "commitment": Reader(write_commitments, read_commitments),
     "study": Reader(write_studies, read_studies),
     "ladder": Reader(write_ladders, read_ladders),
     "climb": Reader(write_climbs, read_climbs, seal_climbs),

@@ -16,7 +16,7 @@ from wbc_bench.cli.common import THREADS, run_command
 from wbc_bench.cli.doors import DemoEval, DemoRecord, DemoTrain
 from wbc_bench.cli.evaluate import Ablation, Eval, Reach, Stress
 from wbc_bench.cli.lists import Bench, ExportController, List
-from wbc_bench.cli.protocol import Freeze, Show, Verify
+from wbc_bench.cli.protocol import Freeze, Reveal, Show, Verify
 from wbc_bench.cli.replay import Film, Replay
 from wbc_bench.cli.results import Compare, Latent, Report
 from wbc_bench.cli.robot import Export, Picture
@@ -44,9 +44,10 @@ Command = (
     | Annotated[List, subcommand("list")]
     | Annotated[
         Annotated[Freeze, subcommand("freeze")]
+        | Annotated[Reveal, subcommand("reveal")]
         | Annotated[Verify, subcommand("verify")]
         | Annotated[Show, subcommand("show")],
-        subcommand("protocol", description="Freeze, verify or show a protocol."),
+        subcommand("protocol", description="Freeze, reveal, verify or show a protocol."),
     ]
     | Annotated[
         Annotated[Export, subcommand("export")] | Annotated[Picture, subcommand("show")],
