@@ -25,7 +25,7 @@ from wbc_bench.results.store import ResultStore
 from wbc_bench.results.stress import read_stress
 from wbc_bench.results.study import Study, StudyError, labels_of, released_rows, released_studies, studies_of
 from wbc_bench.results.tables.stress import write_stress_tables
-from wbc_bench.results.tables.write import write_reach_tables, write_study_tables
+from wbc_bench.results.tables.write import write_reach_tables, write_sealed_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
 
 
@@ -75,6 +75,7 @@ def publish(
         with scratch_folder(out) as made:
             for protocol, methods in evaluated.items():
                 _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
+            write_sealed_tables(evaluated, made / "tables")
             _write_tracks(tracks, made, labels, colours)
             _write_doors(doors, made, labels)
             for stress in ladders:

@@ -41,6 +41,33 @@ def test_wilson_refuses_impossible_counts(k, n):
         stats.wilson(k, n)
 
 
+@pytest.mark.parametrize(
+    ("a", "m", "b", "n", "low", "high"),
+    [  # Newcombe 1998, table II, method 10
+        (56, 70, 48, 80, 0.0524, 0.3339),
+        (9, 10, 3, 10, 0.1705, 0.8090),
+        (6, 7, 2, 7, 0.0582, 0.8062),
+        (5, 56, 0, 29, -0.0381, 0.1926),
+        (0, 10, 0, 20, -0.1611, 0.2775),
+        (0, 10, 0, 10, -0.2775, 0.2775),
+        (10, 10, 0, 20, 0.6791, 1.0),
+        (10, 10, 0, 10, 0.6075, 1.0),
+    ],
+)
+def test_newcombe_against_its_paper(a, m, b, n, low, high):
+    estimate = stats.newcombe(stats.wilson(a, m), stats.wilson(b, n))
+    assert estimate[:3] == pytest.approx((a / m - b / n, low, high), abs=5.1e-5)
+    assert estimate.num_episodes == m + n
+    other = stats.newcombe(stats.wilson(b, n), stats.wilson(a, m))
+    assert other[:3] == pytest.approx((-estimate.point, -estimate.high, -estimate.low))
+
+
+def test_newcombe_covers_the_difference():
+    draws = rng(3).binomial([60, 90], [0.85, 0.7], size=(2000, 2))
+    found = [stats.newcombe(stats.wilson(int(x), 60), stats.wilson(int(y), 90)) for x, y in draws]
+    assert 0.93 < np.mean([estimate.low <= 0.15 <= estimate.high for estimate in found]) < 0.975
+
+
 def test_spread_is_the_sample_deviation():
     assert stats.spread([1.0, 2.0, 6.0]) == pytest.approx((3.0, np.sqrt((4 + 1 + 9) / 2), 3))
     assert np.isnan(stats.spread([1.0]).sd)

@@ -20,6 +20,7 @@ from wbc_bench.results.analysis import Evaluated, rule_of
 from wbc_bench.results.formatting import window_text
 from wbc_bench.results.stress import Stress
 from wbc_bench.results.table import code_html, read_markdown
+from wbc_bench.results.tables.sealed import SUFFIX as SEALED_TABLE
 
 CSS = """
 :root { color-scheme: light; }
@@ -232,7 +233,7 @@ def write(
 
 def _order(path: Path) -> tuple[int, str]:
     """The main table of a protocol first, then from the general to the particular."""
-    suffixes = ("_all", "_outcomes", "_strata", "_pairs", "_motion")
+    suffixes = ("_all", "_outcomes", "_strata", "_pairs", "_motion", SEALED_TABLE)
     known = [k for k, suffix in enumerate(suffixes, 1) if path.stem.endswith(suffix)]
     particular = "_vs_" in path.stem or "_heights_" in path.stem
     return known[0] if known else len(suffixes) + 1 if particular else 0, path.stem
