@@ -156,6 +156,23 @@ def test_chosen_episodes_are_refused_even_where_the_owner_committed_to_them(
     assert names(tmp_path / "out") == []
 
 
+def test_a_set_of_another_processor_is_revealed_by_its_file_alone(kept, commitment, secret, tmp_path):
+    """One that rounds the last digits differently."""
+    sealed = sealed_protocol(SMOKE, SECRET)
+    here, _ = read_manifest(sealed, kept / "smoke_v1_sealed.parquet")
+    columns = {name: array.copy() for name, array in vars(here).items()}
+    for name in ("target_pos_w", "friction", "leg_q"):
+        columns[name].T[0] *= 1 + 1e-13
+    there = tmp_path / "there.parquet"
+    write_manifest(EpisodeManifest(**columns), sealed, there)
+    other = commit(tmp_path, commitment, manifest_sha256=hashlib.sha256(there.read_bytes()).hexdigest())
+    with pytest.raises(SealError, match="give the sealed file with --manifest"):
+        reveal(other, secret, tmp_path / "out")
+    path, _ = reveal(other, secret, tmp_path / "out", manifest=there, sample=12)
+    assert path.with_suffix(".parquet").read_bytes() == there.read_bytes()
+    read_manifest(read_protocol(path), path.with_suffix(".parquet"))
+
+
 def test_damage_that_only_the_hash_admits_is_one_line(commitment, secret, tmp_path):
     broken = tmp_path / "broken.parquet"
     broken.write_bytes(b"PAR1")
