@@ -35,8 +35,8 @@ class IKConfig:
 
     weights: Weights = field(default_factory=Weights)
     # the way of the target
-    slew_linear: float = 0.25  # [m/s]
-    slew_angular: float = 0.75  # [rad/s]
+    slew_linear: float = 0.3  # [m/s]
+    slew_angular: float = 0.9  # [rad/s]
     slew_ramp: float = 0.8  # [s] from rest to full speed
     slew_gain: float = 2.0  # [1/s] slowing down near the end
     settle: float = 0.3  # [s] of standing still before the target moves
@@ -46,7 +46,7 @@ class IKConfig:
     hand_blend: float = 1.5  # [s] before arrival, within one second, the hand's servo takes over
     hand_damping: float = 0.05  # of the arm's inverse kinematics near singular postures
     hand_limit: float = 0.5  # [rad] an arm joint may leave the whole-body solution
-    hand_integral: float = 0.3  # [1/s] on the measured error of the hand
+    hand_integral: float = 0.05  # [1/s] on the measured error of the hand
     hand_integral_limit: float = 0.08  # [m, rad]
     # balance
     feedforward: bool = True  # torques that carry the weight, sent as torque / kp
@@ -65,6 +65,13 @@ class IKConfig:
     compliance: float = 0.5  # part of the legs' posture stiffness that is taken away
     friction: float = 0.4  # the lowest of the protocol's range
     sole_width: float = 0.7  # part of the sole's width that carries contact forces
+    # what measured torques say of the robot
+    payload_time: float = 3.0  # [s] of the observer of the payload
+    payload_limit: float = 3.0  # [kg]
+    payload_after: float = 0.2  # [s] from which on it is observed
+    gain_time: float = 5.0  # [s] of forgetting
+    gain_prior: float = 200.0  # [(N m)^2] weight of the nominal gain
+    gain_limit: float = 0.2  # of the nominal gain
     # stepping
     stepping: bool = True
     step_trigger: float = 0.0  # [m] of the capture point outside the soles' hull
@@ -87,7 +94,10 @@ class IKConfig:
     joint_vel_noise: float = 1.5  # [rad/s]
     joint_acceleration: float = 10.0  # [rad/s^2] process noise of a joint
     com_noise: float = 0.003  # [m] of the centre of mass from joint noise
-    com_acceleration: float = 1.0  # [m/s^2] process noise of the centre of mass
+    com_tilt: float = (
+        0.5  # part of the vertical's error that counts as noise: the rest stays from step to step
+    )
+    com_acceleration: float = 2.0  # [m/s^2] process noise of the centre of mass
     com_jump: float = 0.3  # [m/s] a push
 
 

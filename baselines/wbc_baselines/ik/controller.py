@@ -8,6 +8,7 @@ from wbc_baselines.ik.arm_servo import solve_arm
 from wbc_baselines.ik.balance import distribute_contact_forces, friction_rays
 from wbc_baselines.ik.config import IKConfig
 from wbc_baselines.ik.estimation import ComFilter, GravityFilter, JointFilter
+from wbc_baselines.ik.load import GainObserver, PayloadObserver
 from wbc_baselines.ik.model import GRAVITY, Pose, WholeBodyModel, configuration, leg_of
 from wbc_baselines.ik.reference import Reference, plan_goal_posture
 from wbc_baselines.ik.stance import Stance, base_from_sole, base_from_stance, measured_stance, yaw_matrix
@@ -30,7 +31,9 @@ LEGS, ARM = slice(0, NUM_LEG_JOINTS), slice(NUM_LEG_JOINTS, None)
 class _Episode:
     """What the controller remembers of one episode, in the anchor frame."""
 
-    def __init__(self, stance: Stance, q: Array, reference: Reference, com: ComFilter) -> None:
+    def __init__(
+        self, stance: Stance, q: Array, reference: Reference, com: ComFilter, payload: PayloadObserver
+    ) -> None:
         self.step = 0
         self.swing: Swing | None = None
         self.prepared = False
@@ -39,6 +42,10 @@ class _Episode:
         self.q = q  # (21,) reference configuration
         self.reference = reference
         self.com = com
+        self.payload = payload
+        self.torque = np.zeros(14)  # [N m] measured
+        self.kp = np.ones(14)  # [N m/rad] as observed
+        self.shift = np.zeros(3)  # [m] of the centre of mass by the payload, from the model's
         self.acceleration = np.zeros(3)  # [m/s^2] planned for the centre of mass
         self.turning = np.zeros(3)  # [rad/s^2] integral of the base's orientation error
         self.hand = np.zeros(6)  # [m, rad] integral of the hand's error in the base frame
@@ -56,6 +63,7 @@ class IKController:
         self._joints = JointFilter(PERIOD, s.joint_pos_noise, s.joint_vel_noise, s.joint_acceleration)
         self._gravity = GravityFilter(PERIOD, s.gravity_noise, s.gyro_noise)
         self._rays = friction_rays(s.friction)
+        self._gains = GainObserver(PERIOD, s, robot.kp, robot.kd, robot.effort)
         self._contacts = self._model.corners * np.array([1.0, s.sole_width, 1.0])
         self._weight = np.array([1.0, 1.0, 1.0, s.roll_weight, s.pitch_weight, s.yaw_weight])
 
@@ -66,6 +74,7 @@ class IKController:
         self._joints.reset(measured.joint_pos)
         self._gravity.reset(measured.gravity_b)
         self._first = True
+        self._gains.reset(len(episodes))
         self._episodes = [self._start(i, target) for i in range(len(episodes))]
 
     def act(self, obs: Observation, target: Target) -> JointCommand:
@@ -75,11 +84,14 @@ class IKController:
         if not self._first:  # the first observation is the one of the reset
             self._joints.update(measured.joint_pos, measured.joint_vel)
             self._gravity.update(measured.gravity_b, measured.base_ang_vel_b)
+            self._gains.update(self._sent, self._joints.pos, self._joints.vel, measured.joint_torque)
         self._first = False
         q = np.tile(self._robot.default_q, (len(obs.active), 1))
         infeasible = np.zeros(len(obs.active), dtype=bool)
         for i in np.flatnonzero(obs.active):
             episode = self._episodes[i]
+            episode.torque = measured.joint_torque[i]
+            episode.kp = self._robot.kp * self._gains.factor[i]
             infeasible[i] = not self._step(
                 episode,
                 measured.joint_pos[i],
@@ -89,6 +101,7 @@ class IKController:
                 (target.pos_b[i], target.rot_b[i]),
             )
             q[i] = episode.command
+        self._sent = q
         return JointCommand(q, infeasible)
 
     def _start(self, i: int, target: Target) -> _Episode:
@@ -99,7 +112,7 @@ class IKController:
         com = ComFilter(PERIOD, s.com_noise, s.com_acceleration, s.com_jump, model.com_of(q))
         goal = (pos + rot @ target.pos_b[i], rot @ target.rot_b[i])
         reference = Reference(s, PERIOD, model.ee_of(q), goal, self._robot.default_q)
-        return _Episode(_stance_of(pos, rot, soles_b), q, reference, com)
+        return _Episode(_stance_of(pos, rot, soles_b), q, reference, com, PayloadObserver(PERIOD, s))
 
     def _land(self, e: _Episode, base: Pose, soles_b: list[Pose], joints: Array, target_b: Pose) -> None:
         """Both feet stand again: start over from here, but for what is known of the centre of mass."""
@@ -139,9 +152,11 @@ class IKController:
                 reference.set_goal(e.q[7:].copy(), goal)
             reference.advance()
         weight = s.weights.standing_posture if reference.goal is None else s.weights.posture
+        # the program knows the model's centre of mass, which must stand where the shifted one is inside
+        hull = e.hull - e.shift[:2]
         # the measured stance may be far from the reference: the first step must be free to jump there
         q = self._solver.step(
-            e.q, reference.ee, soles, e.hull, reference.posture, weight, limit_speed=e.step > 1
+            e.q, reference.ee, soles, hull, reference.posture, weight, limit_speed=e.step > 1
         )
         if q is None:
             return False
@@ -152,7 +167,7 @@ class IKController:
             e.command[ARM] += near * (self._hold_hand(e, joints, target_b) - q[7:][ARM])
         if s.feedforward:
             torques = self._balance(e, configuration(pos, rot, raw), rot, ang_vel_b, (0, 1))
-            e.command += np.clip(torques, -self._robot.effort, self._robot.effort) / self._robot.kp
+            e.command += np.clip(torques, -self._robot.effort, self._robot.effort) / e.kp
             e.command[LEGS] += s.compliance * (joints - q[7:])[LEGS]
         if s.stepping and e.step * PERIOD > s.step_wait:
             capture, rate = e.com.capture_point()
@@ -211,7 +226,7 @@ class IKController:
             where = np.array([*xy, height]) - base_pos
             goals.append(solve_leg(model, raw, swing.side, (rot.T @ where, rot.T @ yaw)))
         q, qd, qdd = swing.follow(*goals)
-        kp, kd = self._robot.kp, self._robot.kd
+        kp, kd = e.kp, self._robot.kd
         accelerations = np.zeros(14)
         accelerations[leg] = qdd
         torques[leg] = model.torques(measured, e.acceleration, accelerations)[leg]
@@ -240,15 +255,23 @@ class IKController:
         """Torques (14,) [N m] that carry the weight and bring centre of mass and base to the reference."""
         s, model = self._s, self._model
         model.update(measured)
-        e.com.update(model.data.com[0], e.acceleration, self._gravity.deviation)
         soles = [model.pose(model.soles[side]) for side in standing]
         jacobians = [model.jacobian(model.soles[side]) for side in standing]
+        hand, com = model.jacobian(model.tcp), model.data.com[0].copy()
+        ee = model.pose(model.tcp)[0]
         torques = model.gravity_torques(measured)
+        if e.step * PERIOD > s.payload_after:
+            e.payload.update(hand[:, 14:], torques[14:], e.torque[ARM])
+        torques = torques + e.payload.mass * GRAVITY * hand[2]
+        mass = model.mass + e.payload.mass
+        e.shift = e.payload.mass / mass * (ee - com)
+        com = com + e.shift
+        e.com.update(com, e.acceleration, s.com_tilt * self._gravity.deviation)
         wrench = np.zeros(6)
-        wrench[2] = model.mass * GRAVITY
+        wrench[2] = mass * GRAVITY
         if s.feedback:
-            error = model.com_of(e.q) - e.com.pos
-            wrench[:3] += model.mass * (s.kp_com * error - s.kd_com * e.com.vel)
+            error = model.com_of(e.q) + e.shift - e.com.pos
+            wrench[:3] += mass * (s.kp_com * error - s.kd_com * e.com.vel)
             rot_ref = pin.Quaternion(e.q[3:7]).toRotationMatrix()
             error = rot @ pin.log3(rot.T @ rot_ref)
             limit = s.rot_integral_limit
@@ -257,7 +280,7 @@ class IKController:
         arms = [self._contacts @ r.T for _, r in soles]
         points = np.concatenate([p + arm for (p, _), arm in zip(soles, arms, strict=True)]) - e.com.pos
         forces = distribute_contact_forces(points, self._rays, wrench, self._weight, s.damping)
-        e.acceleration = forces.sum(axis=0) / model.mass
+        e.acceleration = forces.sum(axis=0) / mass
         e.acceleration[2] -= GRAVITY
         for jacobian, arm, force in zip(jacobians, arms, np.split(forces, len(arms)), strict=True):
             torques -= jacobian.T @ np.concatenate([force.sum(axis=0), moment_of(arm, force)])
