@@ -40,7 +40,10 @@ def main() -> int:
             copy = Path(folder) / path.relative_to(results)
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
-        publish(store, Path(folder))
+        for records in ("runs", "tracks", "doors", "stress"):  # as a report beside its records has them
+            if (results / records).exists():
+                (Path(folder) / records).symlink_to((results / records).resolve())
+        publish(ResultStore(folder), Path(folder))
         rebuilt = products(Path(folder))
     problems = [f"not made by the records: {name}" for name in sorted(committed.keys() - rebuilt.keys())]
     problems += [f"not committed: {name}" for name in sorted(rebuilt.keys() - committed.keys())]

@@ -1,5 +1,6 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.episodes.protocol import ReachTargets, protocol_names, read_protocol
+from wbc_bench.episodes.protocol import ReachTargets, load_protocol, protocol_names, read_protocol
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import PROTOCOLS, scratch_folder
 from wbc_bench.results import report
@@ -27,6 +28,7 @@ from wbc_bench.results.study import Study, StudyError, labels_of, released_rows,
 from wbc_bench.results.tables.stress import write_stress_tables
 from wbc_bench.results.tables.write import write_reach_tables, write_sealed_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
+from wbc_bench.robot import RobotConfig
 
 
 def publish(
@@ -50,7 +52,7 @@ def publish(
     known_studies = list({study.name: study for study in (*released_studies(), *studies)}.values())
     rows = [row for study in known_studies for row in study.rows]
     labels = labels_of(rows)
-    evaluated = collect_all(store.runs(), labels)
+    evaluated = dict(sorted(collect_all(store.runs(), labels).items(), key=_place))
     for study in known_studies:
         if study.name != study.protocol and study.name in evaluated:
             raise StudyError(
@@ -83,7 +85,7 @@ def publish(
                 write_stress_tables(stress, found, made / "tables")
                 write_stress_figure(stress, found, made / "figures", colours)
             protocol_of = {study.name: study.protocol for study in known_studies}
-            report.write(evaluated, made, out, protocol_of, ladders)
+            report.write(evaluated, made, out, protocol_of, ladders, os.path.relpath(store.root, out))
             return [
                 _move(path, out / path.relative_to(made))
                 for path in sorted(made.rglob("*"))
@@ -107,6 +109,13 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
     """
     with _writing(out):
         return _write_doors(read_doors(root), out, labels_of(released_rows()))
+
+
+def _place(item: tuple[str, Mapping[str, Evaluated]]) -> tuple[bool, str]:
+    """Order of the protocols in a report: those of the first robot, which later ones replace, come last."""
+    name = item[0]
+    first_robot = name in protocol_names() and load_protocol(name).robot == RobotConfig()
+    return first_robot, name
 
 
 @contextmanager

@@ -337,7 +337,7 @@ def test_every_listed_controller_can_be_given(capsys, tmp_path):
 def test_list_shows_successes_of_a_method_and_of_its_seed(capsys):
     main(["list", "--results", str(Path(__file__).parents[2] / "results")])
     text = capsys.readouterr().out
-    rows = {name: success for name, success, *_ in listed_controllers(text)}
+    rows = {name: first for name, _, first, *_ in listed_controllers(text)}  # under ablation_v1
     episodes = [int(cell.partition("/")[2]) for cell in rows.values() if cell]
     assert episodes and all(count % 1000 == 0 for count in episodes)
     one_seed = [name for name in rows if rows[name].endswith("/1000") and name.endswith("@0")]
@@ -364,8 +364,8 @@ def test_installed_factories_without_variants_or_that_fail_are_listed(capsys, tm
     monkeypatch.setattr(installed, "controllers", lambda: found)
     main(["list", "--results", str(tmp_path)])
     rows = {row[0]: row for row in listed_controllers(capsys.readouterr().out)}
-    assert rows["plain"][2:] == ["", "json:dumps"]
-    assert "cannot be loaded" in rows["gone"][2] and "no_such_module" in rows["gone"][2]
+    assert rows["plain"][3:] == ["", "json:dumps"]
+    assert "cannot be loaded" in rows["gone"][3] and "no_such_module" in rows["gone"][3]
 
 
 def test_a_failing_report_leaves_the_old_one(capsys, tiny, tmp_path, monkeypatch):
@@ -398,7 +398,7 @@ def test_ablation_runs_the_study(capsys, tmp_path):
     text = capsys.readouterr().out
     assert "1/1" in text and "not evaluated" in text
     assert (tmp_path / "report.html").exists()
-    assert len(list((tmp_path / "tables").glob("ablation_v1*.tex"))) >= 4
+    assert len(list((tmp_path / "tables").glob("ablation_v2*.tex"))) >= 4
 
 
 def test_robot_export(tmp_path):

@@ -169,7 +169,7 @@ def test_bad_arguments_are_one_line(tiny, tmp_path):
         wbc_bench.evaluate("hold", tiny, replicates=3)
     with pytest.raises(UnknownNameError, match="valid: dask"):
         wbc_bench.evaluate("hold", tiny, engine="spark")
-    with pytest.raises(UnknownNameError, match="did you mean ablation_v1"):
+    with pytest.raises(UnknownNameError, match="did you mean ablation_v2"):
         wbc_bench.evaluate("hold", "ablation_v")
     with pytest.raises(BenchError, match="'---' cannot name a folder"):
         odd = Counting()

@@ -57,3 +57,9 @@ def test_a_replay_that_is_there_is_a_link_and_another_a_command(tmp_path, made):
     command = "wbc-bench replay p/a-b/replicate_0 --episode 0 --results . -o replays/p/a-b/replicate_0/0.html"
     assert ('<a href="replays/p/a-b/replicate_0/0.html">' in text) is made
     assert (command in text) is not made
+
+
+def test_a_command_leads_to_records_that_stand_elsewhere(tmp_path):
+    frame = frame_of(0, np.array(["fell"]))
+    text = gallery.gallery_html("p", method(frame), tmp_path, "../my records")
+    assert "--results &#x27;../my records&#x27; -o replays/p/a-b" in text

@@ -75,7 +75,7 @@ def test_a_changed_record_is_not_verified(run: Run) -> None:
     shifted = again.stored | {"position_error": float(again.again["position_error"]) + 0.001}
     changed = dataclasses.replace(again, stored=shifted)
     assert list(changed.differences) == ["position_error"]
-    assert "the same outcome, but 1 of 18" in changed.verdict and "position_error by" in changed.verdict
+    assert "the same outcome, but 1 of 27" in changed.verdict and "position_error by" in changed.verdict
 
 
 def test_a_controller_that_rounds_with_its_company_is_run_in_its_shard(

@@ -57,7 +57,7 @@ class _Evaluation:
 class Ablation(_Evaluation):
     """Evaluate every controller of a study on the same episodes, and write its tables and figures."""
 
-    study: str = "ablation_v1"
+    study: str = "ablation_v2"
     """Name of a released study, or path of a .toml file: the controllers that share a table, and the pairs of
     them that are tested against each other."""
     replicates: Replicates = None
@@ -95,7 +95,7 @@ class Reach(_Evaluation):
 
     controller: tuple[str, ...] = ("ik",)
     """Controllers to evaluate, each a name, name:variant, module:attribute or file.py:attribute."""
-    protocol: str = "reach_v1"
+    protocol: str = "reach_v2"
     """Name of a released reach protocol, or path of a .toml file with its manifest beside it."""
 
     def run(self) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from wbc_bench.results.store import Run, RunRecord
     from wbc_bench.results.table import Table
 
-SHOWN = "ablation_v1"  # protocol whose successes stand beside the controllers
+SHOWN = ("ablation_v2", "ablation_v1")  # protocols whose successes stand beside the controllers
 BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
 INPUTS = (
     "wbc_bench.inputs"  # entry points: name -> a callable that returns rows (vector, columns, term, unit)
@@ -66,7 +66,7 @@ def _inputs() -> "Iterator[Table]":
 
 
 def _controllers(runs: "list[Run]") -> "Table":
-    """Every name that `--controller` takes, with the episodes of one protocol that the runs solved."""
+    """Every name that `--controller` takes, with the episodes of the main protocols that the runs solved."""
     from wbc_bench.installed import controllers
     from wbc_bench.results.table import Table
 
@@ -75,8 +75,10 @@ def _controllers(runs: "list[Run]") -> "Table":
         for name, point in sorted(controllers().items())
         for variant, description in _variants(point)
     ]
-    cells = tuple((name, _success(runs, name), *rest) for name, *rest in rows)
-    header = ("Name", f"Success on {SHOWN}", "Description", "Comes from")
+    cells = tuple(
+        (name, *(_success(runs, name, protocol) for protocol in SHOWN), *rest) for name, *rest in rows
+    )
+    header = ("Name", *(f"Success on {protocol}" for protocol in SHOWN), "Description", "Comes from")
     return Table("controllers", "Controllers", header, cells)
 
 
@@ -91,12 +93,12 @@ def _variants(point: "EntryPoint") -> list[tuple[str, str]]:
         return [("", f"cannot be loaded: {error}")]
 
 
-def _success(runs: "list[Run]", spec: str) -> str:
-    """Episodes of the runs of a controller that succeeded, `successes/episodes`; empty without a run.
+def _success(runs: "list[Run]", spec: str, protocol: str) -> str:
+    """Episodes under a protocol that a controller solved, `successes/episodes`; empty without a run.
 
     A run counts for the name that was asked for and for the variant that met its replicate.
     """
-    shown = [run.record for run in runs if run.record.protocol == SHOWN]
+    shown = [run.record for run in runs if run.record.protocol == protocol]
     records = [record for record in shown if spec in (record.controller, _met_by(record))]
     succeeded = sum(record.outcomes.get("success", 0) for record in records)
     return f"{succeeded}/{sum(record.completed for record in records)}" if records else ""

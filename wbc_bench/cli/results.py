@@ -19,7 +19,7 @@ class Compare:
     """First controller, by the name that its runs were evaluated under."""
     b: Positional[str]
     """Second controller, which the first one is compared with."""
-    protocol: str = "ablation_v1"
+    protocol: str = "ablation_v2"
     """Name of the protocol of the runs, or path of its .toml file."""
     results: Path = RESULTS
     """Folder to read the records from."""

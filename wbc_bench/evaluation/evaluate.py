@@ -95,7 +95,7 @@ class Results:
 
 def evaluate(
     controller: str | Controller | ControllerFactory,
-    protocol: str = "ablation_v1",
+    protocol: str = "ablation_v2",
     *,
     episodes: int | None = None,
     replicates: int | None = None,

@@ -54,16 +54,19 @@ def replay_path(protocol: str, controller: str, replicate: int, episode: int) ->
     return f"replays/{_run(protocol, controller, replicate)}/{episode}.html"
 
 
-def replay_command(protocol: str, controller: str, replicate: int, episode: int) -> str:
-    """What writes it, in the folder of the records and the report."""
+def replay_command(protocol: str, controller: str, replicate: int, episode: int, records: str = ".") -> str:
+    """What writes it, in the folder of the report, from which `records` leads to that of the records."""
     run = _run(protocol, controller, replicate)
     page = replay_path(protocol, controller, replicate, episode)
     code = "" if is_installed(controller) else f" --controller {shlex.quote(controller)}"
-    return f"wbc-bench replay {run} --episode {episode} --results . -o {page}{code}"
+    return f"wbc-bench replay {run} --episode {episode} --results {shlex.quote(records)} -o {page}{code}"
 
 
-def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
-    """One table, folded away: a group of rows an outcome. A replay that stands in `beside` is a link."""
+def gallery_html(protocol: str, method: Evaluated, beside: Path, records: str = ".") -> str:
+    """One table, folded away: a group of rows per outcome.
+
+    A replay that stands in `beside` is a link; `records` leads from there to the folder of the records.
+    """
     episodes = method.episodes
     kinds = [name for name in ("condition", "orientation") if any(episodes[name])]
     texts = ("Outcome", "Replicate", "Episode", "Stratum", *(name.capitalize() for name in kinds))
@@ -90,7 +93,7 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
             )
             text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
             text += "".join(f'<td class="number">{value}</td>' for value in values)
-            text += f"<td>{_replay(where, beside)}</td>"
+            text += f"<td>{_replay(where, beside, records)}</td>"
             rows.append(f'<tr class="group">{text}</tr>' if k == 0 else f"<tr>{text}</tr>")
     head = "".join(f"<th>{name}</th>" for name in texts)
     head += (
@@ -104,11 +107,11 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path) -> str:
     )
 
 
-def _replay(where: tuple[str, str, int, int], beside: Path) -> str:
+def _replay(where: tuple[str, str, int, int], beside: Path, records: str) -> str:
     path = replay_path(*where)
     if (beside / path).is_file():
         return f'<a href="{html.escape(path)}">watch</a>'
-    return f"<code>{html.escape(replay_command(*where))}</code>"
+    return f"<code>{html.escape(replay_command(*where, records))}</code>"
 
 
 def _run(protocol: str, controller: str, replicate: int) -> str:

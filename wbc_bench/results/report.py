@@ -162,12 +162,14 @@ def write(
     beside: Path | str | None = None,
     studies: Mapping[str, str] | None = None,
     ladders: Sequence[Stress] = (),
+    records_at: str = ".",
 ) -> Path:
     """Writes `<results_dir>/report.html` from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
     will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol; `ladders`
-    are severity ladders, whose tables and figures form a section each.
+    are severity ladders, whose tables and figures form a section each; `records_at` leads from the report's
+    folder to that of the records.
 
     Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
     """
@@ -200,7 +202,7 @@ def write(
         if protocol in protocols:
             parts.append(f'<p class="rule">{code_html(gallery.order_text(rule))}</p>\n')
             methods = evaluated[protocol].values()
-            parts += [gallery.gallery_html(protocol, method, beside) for method in methods]
+            parts += [gallery.gallery_html(protocol, method, beside, records_at) for method in methods]
         if parts:
             sections.append((protocol or "More", "".join(parts)))
     for prefix, title in GIVEN_SECTIONS:
