@@ -1,7 +1,7 @@
 """A controller that builds on a shipped one: `ik:standing`, with a limit on how fast the arm is commanded.
 
     wbc-bench eval --controller examples/own_controller.py:GentleArm ik:standing \\
-        --protocol nominal_v1 --replicates 1 --episodes 20 --out build/own_controller
+        --protocol nominal_v2 --replicates 1 --episodes 20 --out build/own_controller
 
 On these 20 undisturbed episodes it reaches the target in 16 and falls in 1: all 14 of the strata `arm` and
 `posture`, and 2 of the 6 of `step`, since it never takes a step. `ik:standing` itself reaches 15 and falls in

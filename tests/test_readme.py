@@ -37,7 +37,7 @@ def test_the_script_of_the_readme_runs(
     exec(compile(short, str(README), "exec"), {"__name__": "__main__"})
     printed = capsys.readouterr().out
     assert "| examples/own_controller.py:GentleArm | 2/2 |" in printed
-    assert "## nominal_v1: A = examples/own_controller.py:GentleArm against B = ik:standing\n" in printed
+    assert "## nominal_v2: A = examples/own_controller.py:GentleArm against B = ik:standing\n" in printed
 
 
 def test_the_controller_of_the_guide_runs() -> None:
