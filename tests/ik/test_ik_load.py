@@ -4,6 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from wbc_baselines.ik import make
 from wbc_baselines.ik.config import TUNED
 from wbc_baselines.ik.controller import ARM, PERIOD
 from wbc_baselines.ik.load import GainObserver, PayloadObserver
@@ -71,3 +72,9 @@ def test_a_saturated_drive_does_not_change_its_gain():
     for _ in range(100):
         observer.update(far, ROBOT.default_q[None], np.zeros((1, 14)), ROBOT.effort[None])
     assert observer.factor == pytest.approx(np.ones((1, 14)))
+
+
+def test_the_first_robot_has_no_observers_and_the_papers_has():
+    for variant, observes in (("limx_adapter", False), ("paper", True)):
+        controller = make(load_robot(RobotConfig(variant=variant)))
+        assert controller._s.observe_torques is observes

@@ -8,7 +8,7 @@ feed-forward and feedback: what is left is the whole-body IK alone) and
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from wbc_baselines.ik.config import TUNED
+from wbc_baselines.ik.config import TUNED, TUNED_FOR
 from wbc_bench.errors import ControllerError, UnknownNameError, missing_extra
 from wbc_bench.robot import Robot
 
@@ -42,7 +42,7 @@ class IK:
         """
         if variant not in VARIANTS:
             raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
-        config = replace(TUNED, **CHANGES[variant])
+        config = replace(TUNED_FOR.get(robot.config.variant, TUNED), **CHANGES[variant])
         name = f"ik:{variant}" if variant else "ik"
         # imported here: each solver is needed only by its own variant
         try:

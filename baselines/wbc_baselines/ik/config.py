@@ -3,7 +3,7 @@
 Tuned on the `tuning_*` protocols, which no table uses; the tuning and its budget are in docs/training-log.md.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,7 @@ class IKConfig:
     friction: float = 0.4  # the lowest of the protocol's range
     sole_width: float = 0.7  # part of the sole's width that carries contact forces
     # what measured torques say of the robot
+    observe_torques: bool = True
     payload_time: float = 3.0  # [s] of the observer of the payload
     payload_limit: float = 3.0  # [kg]
     payload_after: float = 0.2  # [s] from which on it is observed
@@ -102,3 +103,16 @@ class IKConfig:
 
 
 TUNED = IKConfig()
+# by variant of the robot; the stiff arm of the first one needs no observers
+TUNED_FOR = {
+    "paper": TUNED,
+    "limx_adapter": replace(
+        TUNED,
+        slew_linear=0.25,
+        slew_angular=0.75,
+        hand_integral=0.3,
+        observe_torques=False,
+        com_tilt=1.0,
+        com_acceleration=1.0,
+    ),
+}

@@ -84,7 +84,8 @@ class IKController:
         if not self._first:  # the first observation is the one of the reset
             self._joints.update(measured.joint_pos, measured.joint_vel)
             self._gravity.update(measured.gravity_b, measured.base_ang_vel_b)
-            self._gains.update(self._sent, self._joints.pos, self._joints.vel, measured.joint_torque)
+            if self._s.observe_torques:
+                self._gains.update(self._sent, self._joints.pos, self._joints.vel, measured.joint_torque)
         self._first = False
         q = np.tile(self._robot.default_q, (len(obs.active), 1))
         infeasible = np.zeros(len(obs.active), dtype=bool)
@@ -260,7 +261,7 @@ class IKController:
         hand, com = model.jacobian(model.tcp), model.data.com[0].copy()
         ee = model.pose(model.tcp)[0]
         torques = model.gravity_torques(measured)
-        if e.step * PERIOD > s.payload_after:
+        if s.observe_torques and e.step * PERIOD > s.payload_after:
             e.payload.update(hand[:, 14:], torques[14:], e.torque[ARM])
         torques = torques + e.payload.mass * GRAVITY * hand[2]
         mass = model.mass + e.payload.mass
