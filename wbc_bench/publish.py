@@ -112,10 +112,10 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
 
 
 def _place(item: tuple[str, Mapping[str, Evaluated]]) -> tuple[bool, str]:
-    """Order of the protocols in a report: those of the first robot, which later ones replace, come last."""
+    """Order of the protocols in a report: the released ones of the paper's robot lead."""
     name = item[0]
-    first_robot = name in protocol_names() and load_protocol(name).robot == RobotConfig()
-    return first_robot, name
+    leads = name in protocol_names() and load_protocol(name).robot != RobotConfig()
+    return not leads, name
 
 
 @contextmanager
