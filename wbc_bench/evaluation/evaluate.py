@@ -55,8 +55,8 @@ class Asked:
             found,
             path,
             *read_manifest(found, manifest_path(path)),
-            _within("replicates", replicates, most.replicates, f"replicates of {found.name}"),
-            _within("episodes", episodes, most.per_replicate, f"episodes per replicate of {found.name}"),
+            within("replicates", replicates, most.replicates, f"replicates of {found.name}"),
+            within("episodes", episodes, most.per_replicate, f"episodes per replicate of {found.name}"),
         )
 
 
@@ -223,7 +223,8 @@ def _loadable(spec: str, asked: Asked, optional: bool) -> tuple[list[int], str]:
     return found, next(iter(problems.values()), "")
 
 
-def _within(name: str, value: int | None, most: int, what: str) -> int:
+def within(name: str, value: int | None, most: int, what: str) -> int:
+    """The value of an option, `most` when it is not given. Raises: EvaluationError, it is not 1 to `most`."""
     if value is None:
         return most
     if not 1 <= value <= most:

@@ -36,7 +36,7 @@ def rollout(
     target_rot_w = matrix_from_wxyz(rows.target_quat_w)
 
     position_error, orientation_error = np.full((2, count, num_steps), np.nan)
-    action, commands = np.full((2, count, num_steps, NUM_JOINTS), np.nan)
+    commands = np.full((count, num_steps, NUM_JOINTS), np.nan)
     work, slip = np.full((2, count, num_steps), np.nan)
     at_torque_limit, at_speed_limit = np.zeros((2, count, num_steps), dtype=bool)
     ee_pos_w = np.full((count, num_steps, 3), np.nan)
@@ -52,7 +52,6 @@ def rollout(
         if on_step is not None:
             on_step(loop)
         state = loop.state
-        action[stepped, step] = loop.simulation.robot.action_of(q[stepped])
         commands[stepped, step] = q[stepped]
         load = loop.simulation.load
         work[stepped, step] = load.work[stepped]
@@ -76,7 +75,7 @@ def rollout(
         outcome=outcome,
         position_error=position_error,
         orientation_error=orientation_error,
-        action=action,
+        action=loop.simulation.robot.action_of(commands),
         command=commands,
         ee_pos_w=ee_pos_w,
         inside=inside,

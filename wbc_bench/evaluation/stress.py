@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from wbc_bench.episodes.ladder import Ladder, freeze_levels, ladder_rows
-from wbc_bench.evaluation.evaluate import EvaluationError
+from wbc_bench.evaluation.evaluate import EvaluationError, within
 from wbc_bench.evaluation.execution import Job, run_jobs
 from wbc_bench.evaluation.workers import Engine
 from wbc_bench.files import ensure_writable, scratch_folder
@@ -51,11 +51,7 @@ def evaluate_stress(
     """
     if not controllers:
         raise EvaluationError("no controller is given, valid: at least one")
-    count = ladder.episodes if episodes is None else episodes
-    if not 1 <= count <= ladder.episodes:
-        raise EvaluationError(
-            f"--episodes {count}: valid: 1 to {ladder.episodes} (episodes per level of {ladder.name})"
-        )
+    count = within("episodes", episodes, ladder.episodes, f"episodes per level of {ladder.name}")
     chosen = ladder.only(factors)
     robot = load_robot(ladder.base.robot)
     specs = list(dict.fromkeys(controllers))

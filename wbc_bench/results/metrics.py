@@ -63,15 +63,18 @@ def orientation_error(batch: EpisodeBatch) -> FloatArray:
 
 def action_variation(batch: EpisodeBatch) -> FloatArray:
     """Mean over t >= 1 of ||a_t - a_{t-1}||^2, actions normalised by the policy's scales."""
-    change = np.sum(np.diff(batch.action, axis=1) ** 2, axis=2)  # (N, T-1) [1]
-    t = np.arange(1, batch.action.shape[1])
-    return mean_where(change, t < batch.steps[:, None])
+    return _mean_squared_change(batch.action, batch)  # [1]
 
 
 def action_variation_rad(batch: EpisodeBatch) -> FloatArray:
     """As `action_variation`, of the commands themselves: it does not depend on an action scale."""
-    change = np.sum(np.diff(batch.command, axis=1) ** 2, axis=2)  # (N, T-1) [rad^2]
-    return mean_where(change, np.arange(1, batch.command.shape[1]) < batch.steps[:, None])
+    return _mean_squared_change(batch.command, batch)  # [rad^2]
+
+
+def _mean_squared_change(values: FloatArray, batch: EpisodeBatch) -> FloatArray:
+    """Mean over t >= 1 of the squared norm of what (N, T, K) `values` change from a step to the next."""
+    change = np.sum(np.diff(values, axis=1) ** 2, axis=2)  # (N, T-1)
+    return mean_where(change, _completed(batch)[:, 1:])
 
 
 def command_rate(batch: EpisodeBatch) -> FloatArray:
@@ -90,8 +93,7 @@ def time_to_reach(batch: EpisodeBatch) -> FloatArray:
 
 def energy(batch: EpisodeBatch) -> FloatArray:
     """Positive mechanical work of the motors: what a drive that recovers nothing takes, heat aside."""
-    total = np.where(np.isnan(batch.work), 0.0, batch.work).sum(axis=1)
-    return np.where(batch.steps > 0, total, np.nan)  # [J]
+    return _total(batch.work, batch)  # [J]
 
 
 def mean_power(batch: EpisodeBatch) -> FloatArray:
@@ -107,8 +109,13 @@ def speed_limit_share(batch: EpisodeBatch) -> FloatArray:
 
 
 def foot_slip(batch: EpisodeBatch) -> FloatArray:
-    total = np.where(np.isnan(batch.slip), 0.0, batch.slip).sum(axis=1)
-    return np.where(batch.steps > 0, total, np.nan)  # [m]
+    return _total(batch.slip, batch)  # [m]
+
+
+def _total(values: FloatArray, batch: EpisodeBatch) -> FloatArray:
+    """Sum of (N, T) `values` over the completed steps; NaN without a step."""
+    total = np.where(np.isnan(values), 0.0, values).sum(axis=1)
+    return np.where(batch.steps > 0, total, np.nan)
 
 
 def push_error(batch: EpisodeBatch) -> FloatArray:
