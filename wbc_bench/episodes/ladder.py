@@ -20,7 +20,7 @@ from wbc_bench.episodes.protocol import (
     check_protocol,
     find_protocol,
 )
-from wbc_bench.episodes.randomization import EpisodeDraws, nominal, sample
+from wbc_bench.episodes.randomization import draw_columns
 from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.errors import BenchError, UnknownNameError
 from wbc_bench.files import LONGEST_NAME, PROTOCOLS, is_folder_name
@@ -255,7 +255,7 @@ def freeze_levels(ladder: Ladder, rows: EpisodeManifest, folder: Path) -> list[F
     for protocol in ladder.protocols():
         depends = protocol.randomization, protocol.push
         if depends not in drawn:
-            drawn[depends] = _draws(protocol, rows)
+            drawn[depends] = draw_columns(protocol, rows)
         manifest = replace(rows, **drawn[depends])
         path = folder / f"{protocol.name}.toml"
         path.write_text(protocol_toml(protocol), encoding="utf-8")
@@ -265,16 +265,6 @@ def freeze_levels(ladder: Ladder, rows: EpisodeManifest, folder: Path) -> list[F
         file.with_suffix(".sha256").write_text(f"{sha256}  {file.name}\n")
         frozen.append(FrozenLevel(protocol, manifest, sha256, path))
     return frozen
-
-
-def _draws(protocol: EvalProtocol, rows: EpisodeManifest) -> dict[str, np.ndarray]:
-    """Columns of a manifest that an episode draws besides its target."""
-    keys = zip(rows.replicate.tolist(), rows.episode.tolist(), rows.condition, strict=True)
-    draws = [(nominal if kind == "nominal" else sample)(protocol, k, i) for k, i, kind in keys]
-    return {
-        name: np.array(values)
-        for name, values in zip(EpisodeDraws._fields, zip(*draws, strict=True), strict=True)
-    }
 
 
 def protocol_toml(protocol: EvalProtocol) -> str:

@@ -91,7 +91,7 @@ def read_manifest(
         )
     count = protocol.episodes.replicates * protocol.episodes.per_replicate
     table = decode_parquet(data, path, "manifest", ManifestError)
-    made_for = (table.schema.metadata or {}).get(b"protocol_digest", b"").decode(errors="replace")
+    made_for = digest_made_for(table)
     if made_for != protocol.digest:
         raise ManifestError(
             f"manifest '{path}' was made for protocol digest {made_for[:16] or 'none'}..., "
@@ -117,6 +117,11 @@ def read_manifest(
                 f"manifest '{path}': {mistake}; `wbc-bench protocol verify {_given(path)}` tells all"
             )
     return manifest, sha256
+
+
+def digest_made_for(table: pa.Table) -> str:
+    """Digest of the protocol that a manifest says it was made for; empty where it says none."""
+    return (table.schema.metadata or {}).get(b"protocol_digest", b"").decode(errors="replace")
 
 
 def check_robot(table: pa.Table, protocol: EvalProtocol, what: str, remedy: str) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.episodes.randomization import EpisodeDraws, nominal, resting_height, sample
+from wbc_bench.episodes.randomization import draw_columns, resting_height
 from wbc_bench.episodes.rows import EpisodeManifest, neutral
 from wbc_bench.episodes.targets import BEYOND
 from wbc_bench.episodes.terrain import TERRAIN_SPAN
@@ -149,10 +149,8 @@ def _pose_mistakes(manifest: EpisodeManifest) -> Iterator[str]:
 
 def _draw_mistakes(protocol: EvalProtocol, manifest: EpisodeManifest) -> Iterator[str]:
     """Columns that are not what the protocol's seed draws."""
-    rows = zip(manifest.replicate.tolist(), manifest.episode.tolist(), manifest.condition, strict=True)
-    drawn = [(nominal if kind == "nominal" else sample)(protocol, k, i) for k, i, kind in rows]
-    for name, values in zip(EpisodeDraws._fields, zip(*drawn, strict=True), strict=True):
-        off = ~np.isclose(getattr(manifest, name), np.array(values), rtol=0, atol=SAME, equal_nan=True)
+    for name, drawn in draw_columns(protocol, manifest).items():
+        off = ~np.isclose(getattr(manifest, name), drawn, rtol=0, atol=SAME, equal_nan=True)
         if off.any():
             i = int(off.reshape(len(manifest), -1).any(axis=1).argmax())
             place = f"{manifest.replicate[i]}/{manifest.episode[i]}"

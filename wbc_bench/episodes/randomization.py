@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Push
-from wbc_bench.episodes.rows import neutral
+from wbc_bench.episodes.rows import EpisodeManifest, neutral
 from wbc_bench.episodes.terrain import TERRAIN_SPAN, highest_near
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, RobotConfig, load_robot
@@ -110,6 +110,19 @@ def nominal(protocol: EvalProtocol, replicate: int, episode: int) -> EpisodeDraw
         noise_scale=0.0,
         **{name: column[0] for name, column in neutral(1).items()},
     )
+
+
+def draw(protocol: EvalProtocol, replicate: int, episode: int, condition: str) -> EpisodeDraws:
+    """What an episode draws under its condition: nothing if that is `nominal`."""
+    return (nominal if condition == "nominal" else sample)(protocol, replicate, episode)
+
+
+def draw_columns(protocol: EvalProtocol, rows: EpisodeManifest) -> dict[str, Array]:
+    """Columns of a manifest that the episodes of `rows` draw besides their targets."""
+    keys = zip(rows.replicate.tolist(), rows.episode.tolist(), rows.condition, strict=True)
+    draws = (draw(protocol, replicate, episode, condition) for replicate, episode, condition in keys)
+    columns = zip(EpisodeDraws._fields, zip(*draws, strict=True), strict=True)
+    return {name: np.array(values) for name, values in columns}
 
 
 def noise_key(protocol: EvalProtocol, replicate: int, episode: int) -> int:

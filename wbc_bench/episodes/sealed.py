@@ -15,7 +15,7 @@ import msgspec
 from wbc_bench.episodes.freeze import freeze
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.ladder import protocol_toml
-from wbc_bench.episodes.manifest import check_robot
+from wbc_bench.episodes.manifest import check_robot, digest_made_for
 from wbc_bench.episodes.protocol import EvalProtocol, check_protocol, find_protocol, protocol_names
 from wbc_bench.episodes.targets import Progress
 from wbc_bench.episodes.verify import verify
@@ -221,7 +221,7 @@ def _check_hash(data: bytes, commitment: Commitment, what: str, why: str) -> Non
 def _check_values(data: bytes, path: Path, sealed: EvalProtocol, out: Path, sample: int) -> None:
     """Raises: SealError, ManifestError: the episodes of a committed file are not those of the secret."""
     table = decode_parquet(data, path, "manifest", SealError)
-    made_for = (table.schema.metadata or {}).get(b"protocol_digest", b"").decode(errors="replace")
+    made_for = digest_made_for(table)
     if made_for != sealed.digest:
         raise SealError(
             f"manifest '{path}' is the committed one, but was not drawn from this secret: it was made for "

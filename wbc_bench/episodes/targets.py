@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.episodes.randomization import nominal, sample
+from wbc_bench.episodes.randomization import draw
 from wbc_bench.episodes.static_solver import StaticSolver, Witness, static_solver
 
 Array = NDArray[np.float64]
@@ -57,8 +57,7 @@ def manifest_row(
     protocol: EvalProtocol, replicate: int, episode: int, target: TargetDraw, **labels
 ) -> dict[str, object]:
     """The columns of one episode: its target, its draws, and what else a kind of target says of it."""
-    make = nominal if labels.get("condition") == "nominal" else sample
-    draws = make(protocol, replicate, episode)
+    draws = draw(protocol, replicate, episode, labels.get("condition", ""))
     return {
         "replicate": replicate,
         "episode": episode,
