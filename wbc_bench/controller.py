@@ -64,6 +64,16 @@ class Privileged(NamedTuple):
     joint_acc: Array  # (N, 14) [rad/s^2]
     ee_lin_vel_b: Array  # (N, 3) [m/s]
     ee_ang_vel_b: Array  # (N, 3) [rad/s]
+    # what an episode draws and hides, see `wbc_bench.episodes.protocol.Randomization`
+    payload: Array  # (N,) [kg] in the hand
+    payload_offset: Array  # (N, 3) [m] from the end-effector, in the frame of its link
+    motor_strength: Array  # (N,)
+    joint_offset: Array  # (N, 14) [rad]
+    imu_tilt: Array  # (N, 2) [rad] rotation vector
+    command_delay: Array  # (N,) [s]
+    observation_delay: Array  # (N,) [s]
+    odometry_delay: Array  # (N,) [s]
+    odometry_error_b: Array  # (N, 3) [m] how far its drift puts the base off
 
 
 class Observation(NamedTuple):

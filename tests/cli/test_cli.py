@@ -269,7 +269,7 @@ def test_interrupted_says_that_it_resumes(tmp_path):
         # what a script starts in the background inherits that interrupts are ignored
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300  # of a process that hangs, on a machine of any load
     while not list(tmp_path.rglob("shard_*.parquet")):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.01)
@@ -349,7 +349,7 @@ def test_list_needs_no_torch(tmp_path):
     code = "import sys; from wbc_bench.cli.main import main; main(['list']); sys.exit('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "learned:" in done.stdout and "control steps of training" in done.stdout
+    assert "learned:" in done.stdout and "control steps" in done.stdout
 
 
 def test_installed_factories_without_variants_or_that_fail_are_listed(capsys, tmp_path, monkeypatch):

@@ -219,14 +219,17 @@ def test_another_control_period(sound):
 
 def test_names_of_shipped_checkpoints(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path)
-    write(tmp_path, "cenet", seed=0)
-    write(tmp_path, "gru", seed=1)
-    assert checkpoint.available() == ["cenet@0", "gru@1"]
+    write(tmp_path / "limx_adapter", "cenet", seed=0)
+    write(tmp_path / "limx_adapter", "gru", seed=1)
+    assert checkpoint.available("limx_adapter") == ["cenet@0", "gru@1"]
+    assert checkpoint.available("paper") == []
     assert load_controller("learned:cenet@0", load_robot()).info.name == "learned:cenet@0"
     with pytest.raises(UnknownNameError, match=r"unknown checkpoint 'gru@0'.*did you mean gru@1"):
         load_controller("learned:gru@0", load_robot())
     with pytest.raises(UnknownNameError, match="did you mean cenet@0"):
         load_controller("learned:cent@0", load_robot())
+    with pytest.raises(UnknownNameError, match=r"cenet@0'.*none trained or shipped for the robot 'paper'"):
+        load_controller("learned:cenet@0", load_robot(RobotConfig(variant="paper")))
 
 
 def test_a_method_stands_for_one_seed_a_replicate():

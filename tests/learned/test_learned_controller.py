@@ -224,7 +224,7 @@ def test_another_period_is_refused(smoke: EvalProtocol, calm_rows: CalmRows):
 def test_one_seed_a_replicate(capsys, tmp_path, monkeypatch):
     """`learned:METHOD` is met by seed k in replicate k; a missing seed is an error."""
     monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path / "shipped")
-    written = [write(tmp_path / "shipped", "cenet", seed) for seed in (0, 1)]
+    written = [write(tmp_path / "shipped" / "limx_adapter", "cenet", seed) for seed in (0, 1)]
     tiny = write_tiny(tmp_path, replicates=3)
     out = tmp_path / "out"
     words = [
@@ -256,7 +256,7 @@ def test_the_study_says_which_seeds_are_missing(tmp_path, monkeypatch):
     from wbc_bench.results.store import ResultStore
 
     monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path)
-    write(tmp_path, "gru", 1)
+    write(tmp_path / "limx_adapter", "gru", 1)
     store, asked = ResultStore(tmp_path / "out"), Asked.of(str(write_tiny(tmp_path, replicates=3)))
     found = evaluate_all(["learned:gru", "learned:oracle"], asked, store, Engine(), optional=True)
     assert list(found) == ["learned:gru replicate 0, 2", "learned:oracle"]

@@ -180,7 +180,7 @@ def test_a_method_begins_with_the_oracle_whose_knowledge_is_at_its_mean(method, 
 def test_a_start_has_no_context_or_a_known_one(tmp_path):
     path = write(tmp_path, "cenet")
     with pytest.raises(CheckpointError, match="is of cenet, valid: a method without a context, the oracle"):
-        checkpoint.load_init_checkpoint(str(path), "gru")
+        checkpoint.load_init_checkpoint(str(path), "gru", "limx_adapter")
 
 
 def test_the_normaliser_of_a_start_counts():

@@ -153,7 +153,7 @@ def test_a_run_with_every_loss_resumes_bit_by_bit(tmp_path):
 
 def test_a_teacher_has_no_memory(tmp_path):
     with pytest.raises(CheckpointError, match="is of gru, valid: a method without an estimated context"):
-        checkpoint.load_teacher(str(write(tmp_path, "gru")))
+        checkpoint.load_teacher(str(write(tmp_path, "gru")), "limx_adapter")
     with pytest.raises(TrainingError, match="--distillation-steps 0: valid: more than 0"):
         trainer(distillation_steps=0)
     with pytest.raises(TrainingError, match="--arm-ik-loss 2 1: valid: 0 <= begin <= end"):
@@ -219,7 +219,8 @@ def test_legs_move_a_part_of_their_posture_error(monkeypatch):
 
 
 def test_the_arm_imitates_beside_ppo_during_its_interval():
-    t, _ = with_arm_ik(arm_ik_loss=(STEPS, 3 * STEPS))
+    steps = 4 * STEPS  # four times the environments, so that some state of every rollout is imitated
+    t, _ = with_arm_ik(arm_ik_loss=(steps, 3 * steps), num_envs=32)
     active = ["loss/arm_ik" in t.iterate() for _ in range(4)]
     assert active == [False, True, True, False]
 

@@ -14,7 +14,7 @@ from training_targets import PROTOCOL, TARGETS, coarse, manifest_of
 from wbc_baselines.learned.policy import inputs
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
-from wbc_baselines.learned.training.environment import Environment, noise_half_widths
+from wbc_baselines.learned.training.environment import Environment
 from wbc_baselines.learned.training.make import training_protocol
 from wbc_baselines.learned.training.resets import (
     DECAY,
@@ -24,6 +24,7 @@ from wbc_baselines.learned.training.resets import (
     scale_disturbances,
     stratum_probabilities,
 )
+from wbc_baselines.learned.training.sensing import noise_half_widths
 from wbc_baselines.learned.training.state_view import rotation_from_wxyz
 from wbc_baselines.learned.training.target_set import (
     TARGET_SETS,
@@ -66,7 +67,7 @@ def test_the_physics_is_the_evaluations():
     robot = load_robot(PROTOCOL.robot)
     for action in actions(15):
         command = torch.tensor(robot.command_of(action.double().numpy()), dtype=torch.float32)
-        state = backend.step(command)
+        _, state = backend.step(command[None])
         simulation.step(command.double().numpy(), np.ones(N, dtype=bool))
     truth = simulation.state()
     for mine, theirs in (
@@ -207,14 +208,14 @@ def test_pushes_are_the_manifests():
         np.testing.assert_array_equal(
             step[0], np.where(np.isnan(time), -1, np.round(np.nan_to_num(time) / 0.02))
         )
-        np.testing.assert_array_equal(velocity[0].ravel(), expected)
+        np.testing.assert_array_equal(velocity[0, :, :2].ravel(), expected)
 
 
 def test_training_may_push_more_often():
     """As many as fit, each within the interval asked for, none in the quiet end."""
     often = training_protocol(TrainConfig("no_latent", push_interval=(1.5, 3.0)))
     step, velocity = sample_pushes(often, 400, stream(1, "test"))
-    assert step.shape == (400, 6) and velocity.shape == (400, 6, 2)
+    assert step.shape == (400, 6) and velocity.shape == (400, 6, 6)
     came = step >= 0
     assert set(came.sum(1)) <= {2, 3, 4, 5} and came.sum() > 3 * 400 * 0.9
     gaps = np.diff(step, axis=1, prepend=0)[came]
@@ -233,7 +234,7 @@ def test_a_push_comes_at_its_step():
         env._episode.push_step.fill_(-1)
         env.begin_rollout(0, 1)
     with_push._episode.push_step[2, 0] = with_push._episode.step[2]
-    with_push._episode.push_vel[2, 0] = torch.tensor([0.4, -0.2])
+    with_push._episode.push_vel[2, 0, :2] = torch.tensor([0.4, -0.2])
     moved = []
     for env, expected in ((with_push, [2]), (without, [])):
         assert env.step(torch.zeros(N, 14)).pushed.nonzero()[:, 0].tolist() == expected

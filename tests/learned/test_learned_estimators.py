@@ -44,7 +44,7 @@ PARAMETERS = {
     "transformer": WINDOW + DECODER,
     "transformer_gru": WINDOW + MEMORY + DECODER,
 }  # fmt: skip
-CONTEXT = {"none": 0, "oracle": 80, "cenet": 19, "gru": 67, "transformer": 67, "transformer_gru": 67}
+CONTEXT = {"none": 0, "oracle": 107, "cenet": 19, "gru": 67, "transformer": 67, "transformer_gru": 67}
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

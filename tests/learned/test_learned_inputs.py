@@ -28,7 +28,8 @@ def ee(pos: torch.Tensor, rot: torch.Tensor) -> torch.Tensor:
 def test_dimensions_are_the_paper_s():
     widths = (inputs.OBSERVATION, inputs.COMMAND, inputs.HISTORY, inputs.HISTORY_FRAME, inputs.CONTEXT_MAX)
     assert widths == (58, 9, 10, 57, 67)
-    assert (inputs.NEXT_OBSERVATION, inputs.PRIVILEGED, inputs.ACTIONS) == (49, 80, 14)
+    assert (inputs.NEXT_OBSERVATION, inputs.PAPER_PRIVILEGED, inputs.ACTIONS) == (49, 80, 14)
+    assert inputs.PRIVILEGED == 80 + 1 + 3 + 1 + 14 + 2 + 3 + 3  # and the hidden disturbances
 
 
 def test_terms_stand_where_the_layout_says():

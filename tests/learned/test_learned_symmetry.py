@@ -57,9 +57,9 @@ def test_mirrored_actions_lead_to_mirrored_observations():
     whole = critic_mirror(ROBOT)
     tolerance = np.full(67, 0.03)
     tolerance[20:34] = 0.4  # [rad/s] joint velocities, up to 6
-    wide = np.concatenate([tolerance, np.full(80, 0.05)])
+    wide = np.concatenate([tolerance, np.full(107, 0.05)])
     wide[70:84], wide[84:98] = 1.0, 40.0  # [N m] up to 90, [rad/s^2] up to 300
-    wide[102:105], wide[-6:] = 0.6, 2.0  # [rad/s] of the hand, [N] up to 80
+    wide[102:105], wide[141:147] = 0.6, 2.0  # [rad/s] of the hand, [N] up to 80
     rng = np.random.default_rng(1)
     for env in (left, right):
         env.begin_rollout(0, 10)
@@ -77,7 +77,7 @@ def test_mirrored_actions_lead_to_mirrored_observations():
 
 
 def test_a_mirror_image_of_a_mirror_image_is_the_thing_itself():
-    for mirror, size in ((critic_mirror(ROBOT), 147), (input_mirror(ROBOT), 67), (joint_mirror(ROBOT), 14)):
+    for mirror, size in ((critic_mirror(ROBOT), 174), (input_mirror(ROBOT), 67), (joint_mirror(ROBOT), 14)):
         x = np.random.default_rng(2).normal(size=(3, size)).astype(np.float32)
         np.testing.assert_array_equal(mirror(mirror(x)), x)
         assert not np.array_equal(mirror(x), x)

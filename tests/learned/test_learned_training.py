@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 
 import msgspec
@@ -34,6 +35,7 @@ from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.curves import curves_figure, measured_scores, smooth, write_curves
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment
 from wbc_baselines.learned.training.make import make_environment
+from wbc_baselines.learned.training.precision import fast_products
 from wbc_baselines.learned.training.resets import sample_episodes
 from wbc_baselines.learned.training.returns import generalized_advantages
 from wbc_baselines.learned.training.run_folder import RunFolder, run
@@ -130,6 +132,7 @@ def test_the_policys_gradient_never_reaches_the_estimator():
 def test_the_rollout_gives_the_contexts_back(method, monkeypatch):
     """Unrolled from stored state and resets, the windows yield the contexts the actor saw."""
     monkeypatch.setattr(torch, "randn", lambda *size, device=None: torch.zeros(*size))
+    monkeypatch.setattr("wbc_baselines.learned.training.trainer.fast_products", nullcontext)
     t = trainer(method=method)
     t.environment._episode.step[:] = t.environment.protocol.num_steps - torch.tensor(
         [2, 3, 4, 5, 8, 9, 10, 11]
@@ -691,3 +694,40 @@ def test_the_bench_times_the_engine_and_leaves_it_as_it_was():
     assert fast.evaluation is not None and 0.0 < fast.evaluation < 1.0
     assert slow.evaluation is None  # no such policy ships
     assert cpu.Batch is simulation.Batch is Batch
+
+
+def test_products_are_fast_inside_only():
+    before = torch.get_float32_matmul_precision()
+    with pytest.raises(ZeroDivisionError), fast_products(torch.device("cpu")):
+        assert torch.get_float32_matmul_precision() == "medium"
+        raise ZeroDivisionError
+    assert torch.get_float32_matmul_precision() == before
+    t = trainer()
+    t.iterate()
+    assert torch.get_float32_matmul_precision() == before
+
+
+def test_a_gradient_of_fast_products_points_where_the_exact_one_does():
+    """PPO's first gradient for the same rollout, in bfloat16 where the processor has it."""
+    gradients = []
+    for context in (fast_products, nullcontext):
+        t, found = trainer(method="oracle", num_envs=64), []
+        t.environment.begin_rollout(0, TINY.num_steps_per_env)
+        _, pushed = t.collect_rollout()
+        t.ppo.compute_advantages(t._observations(), pushed)
+
+        def keep(*_, actor=t.ppo.actor, found=found) -> None:
+            rows = [p.grad.flatten().clone() for p in actor.mlp.parameters() if p.grad is not None]
+            found.append(torch.cat(rows))
+
+        t.ppo.optimizer.register_step_pre_hook(keep)
+        storage = t.ppo.storage
+        with context(t.device):
+            with torch.no_grad():  # the rollout's own are of fast products: a ratio of 1 for both
+                t.ppo.actor(storage.observations.flatten(0, 1), stochastic_output=True)
+                old = t.ppo.actor.get_output_log_prob(storage.actions.flatten(0, 1))
+                storage.actions_log_prob[:] = old.reshape(storage.actions_log_prob.shape)
+            torch.manual_seed(1)
+            t.ppo.update()
+        gradients.append(found[0])
+    assert torch.nn.functional.cosine_similarity(*gradients, dim=0) > 0.99

@@ -33,6 +33,10 @@ _WIDTHS = {  # signals with noise, in the order of their columns
     "ee_pos": 3,
     "ee_rot": 6,
 }
+_HIDDEN = (  # fields of Privileged that are columns of the manifest
+    *("payload", "payload_offset", "motor_strength", "joint_offset", "imu_tilt"),
+    *("command_delay", "observation_delay", "odometry_delay"),
+)
 
 
 class Sensors:
@@ -123,6 +127,8 @@ class Sensors:
                 joint_torque=state.joint_torque,
                 foot_pos_b=(state.foot_pos_w - state.base_pos_w[:, None]) @ rot_w,
                 **self._rates(state),
+                **{name: getattr(rows, name) for name in _HIDDEN},
+                odometry_error_b=np.einsum("nji,nj->ni", rot_w, self._drift_at(step)),
             )
         return Observation(
             time,
@@ -157,11 +163,13 @@ class Sensors:
     def in_base(self, odometry: State, pos_w: Array, rot_w: Array, step: int = 0) -> Target:
         """Poses (N, 3) [m], (N, 3, 3) of the world in the base frame that odometry gives, drift included."""
         base = odometry.base_rot_w
-        believed = odometry.base_pos_w
-        if self._drift is not None:
-            believed = believed + self._drift[step]
+        believed = odometry.base_pos_w + self._drift_at(step)
         pos_b = np.einsum("nji,nj->ni", base, pos_w - believed)
         return _locked(Target(pos_b, np.swapaxes(base, 1, 2) @ rot_w))
+
+    def _drift_at(self, step: int) -> Array:
+        """How far (N, 3) [m] the odometry puts the base off at a control step; zeros without drift."""
+        return np.zeros_like(self._rows.target_pos_w) if self._drift is None else self._drift[step]
 
 
 def _locked(part: T) -> T:

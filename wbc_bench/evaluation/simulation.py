@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -70,8 +70,16 @@ class State(NamedTuple):
     diverged: NDArray[np.bool_]  # (N,)
 
 
-def scale_gains(robot: Robot, fields: Callable[[str], Array], kp: Array, kd: Array) -> None:
-    """Multiply the gains of PD loops by factors (N, 14); `fields(name)` is a model field of N simulations."""
+def scale_gains(robot: Robot, fields: Callable[[str], Any], kp: Any, kd: Any) -> None:
+    """Multiply the gains of PD loops by factors (N, 14).
+
+    Args:
+        robot: Robot of the simulations.
+        fields: Gives a model field of N simulations by its name, which is changed; of NumPy or PyTorch, as
+            are the factors.
+        kp: Factors of the stiffness.
+        kd: Factors of the damping.
+    """
     gain = fields("actuator_gainprm")
     if robot.facts.variant.motor is None:
         gain[:, :, 0] *= kp

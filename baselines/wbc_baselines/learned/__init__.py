@@ -1,6 +1,7 @@
 """The learned controllers: policies with a context estimator, their training, checkpoints and export.
 
-`learned:METHOD@SEED` is a checkpoint of this package, `learned:PATH.safetensors` one in a file.
+`learned:METHOD@SEED` is a checkpoint of this package, that of the robot to control, and
+`learned:PATH.safetensors` one in a file.
 `learned:METHOD` stands for all seeds of a method: replicate k of a protocol is evaluated with seed k.
 """
 
@@ -39,19 +40,19 @@ class Learned:
         return variant if one else f"{variant}@{replicate}"
 
     def variants(self) -> list[tuple[str, str]]:
-        """Return METHOD and METHOD@SEED of every packaged checkpoint, and how long each was trained."""
-        paths = sorted(CHECKPOINTS.glob("*@*.json"))
-        cards = [read_json(path, _Training, "checkpoint card", ControllerError) for path in paths]
-        seeds: dict[str, list[_Training]] = {}
-        for card in cards:
-            seeds.setdefault(card.method, []).append(card)
+        """Return METHOD and METHOD@SEED of every packaged checkpoint, with its training."""
+        trained: dict[str, dict[str, list[str]]] = {}  # by method and by METHOD@SEED
+        for path in sorted(CHECKPOINTS.glob("*/*@*.json")):
+            card = read_json(path, _Training, "checkpoint card", ControllerError)
+            told = f"for {path.parent.name} {card.samples:,} control steps"
+            trained.setdefault(card.method, {}).setdefault(f"{card.method}@{card.seed}", []).append(told)
         found = []
-        for method, trained in seeds.items():
-            numbers = ", ".join(str(card.seed) for card in trained)
+        for method, seeds in trained.items():
+            numbers = ", ".join(name.partition("@")[2] for name in seeds)
             found.append((method, f"Replicate k is evaluated with training seed k, one of: {numbers}."))
-            for card in trained:
-                budget = f"{card.samples:,} control steps of training"
-                found.append((f"{method}@{card.seed}", f"Training seed {card.seed}, {budget}."))
+            for name, told in seeds.items():
+                seed = name.partition("@")[2]
+                found.append((name, f"Training seed {seed}; trained {', '.join(told)}."))
         return [*found, ("FILE.safetensors", "A checkpoint of your own, see `wbc-train --help`.")]
 
 

@@ -2,5 +2,5 @@
 
 from pathlib import Path
 
-CHECKPOINTS = Path(__file__).with_name("checkpoints")  # METHOD@SEED.safetensors and .json
+CHECKPOINTS = Path(__file__).with_name("checkpoints")  # ROBOT/METHOD@SEED.safetensors and .json
 TARGET_SETS = Path(__file__).with_name("target_sets")  # PROTOCOL.parquet

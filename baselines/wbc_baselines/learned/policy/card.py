@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
+from wbc_baselines.learned.policy.estimators import Estimator, Oracle, make_estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench import provenance
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -212,7 +212,7 @@ def decode_card(text: bytes, where: str) -> PolicyCard:
     card = decode_json(text, where, PolicyCard, "checkpoint card", CheckpointError)
     if card.method not in METHODS:
         raise UnknownNameError("method", card.method, METHODS, where)
-    here = _dimensions(make_estimator(METHODS[card.method].estimator))
+    here = _dimensions(estimator_of(card))
     if differences := _differences(card.dimensions, here):
         raise CheckpointError(f"checkpoint card '{where}' has other dimensions: {differences}")
     if card.robot_digest != _digest(card.robot):
@@ -240,6 +240,21 @@ def check_fit(card: PolicyCard, robot: Robot | None, control_period: float | Non
     here = robot_facts(robot, period) if robot else msgspec.structs.replace(card.robot, control_period=period)
     if differences := _differences(card.robot, here):
         raise CheckpointError(f"checkpoint '{where}' was trained on another robot: {differences}")
+
+
+def estimator_of(card: PolicyCard) -> Estimator:
+    """Create the estimator of a policy, with random weights.
+
+    Args:
+        card: Card of the policy, of a method that exists.
+
+    Returns:
+        The estimator; that of an oracle has as many columns as the oracle was trained with.
+    """
+    name = METHODS[card.method].estimator
+    if name == "oracle" and card.dimensions.context in Oracle.context_dims:
+        return Oracle(card.dimensions.context)
+    return make_estimator(name)
 
 
 def card_path(path: Path) -> Path:

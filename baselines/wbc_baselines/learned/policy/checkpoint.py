@@ -9,8 +9,15 @@ from safetensors.torch import save as bytes_of
 
 from wbc_baselines.learned.packaged import CHECKPOINTS
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, card_path, check_fit, read_card
-from wbc_baselines.learned.policy.estimators import Estimator, make_estimator
+from wbc_baselines.learned.policy.card import (
+    CheckpointError,
+    PolicyCard,
+    card_path,
+    check_fit,
+    estimator_of,
+    read_card,
+)
+from wbc_baselines.learned.policy.estimators import Estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.networks import Actor
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -78,7 +85,7 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
     if protocol is not None:
         robot = load_robot(protocol.robot)
     check_fit(card, robot, protocol.control_period if protocol else None, str(path))
-    estimator = make_estimator(METHODS[card.method].estimator)
+    estimator = estimator_of(card)
     actor = Actor(estimator.context_dim)
     modules = {"actor": actor, "estimator": estimator}
     wanted = {f"{part}.{name}": v for part, m in modules.items() for name, v in m.state_dict().items()}
@@ -88,17 +95,18 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
     return Checkpoint(card, actor.eval(), estimator.eval())
 
 
-def identity(name: str) -> str:
+def identity(name: str, robot: str) -> str:
     """Return name and SHA-256 of a checkpoint, for the cards of those trained from it; "" for no name."""
-    return f"{find(name).stem} {read_card(find(name)).sha256}" if name else ""
+    return f"{find(name, robot).stem} {read_card(find(name, robot)).sha256}" if name else ""
 
 
-def load_init_checkpoint(name: str, estimator: str) -> Checkpoint:
+def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
     """Load a checkpoint that can initialize a method with this estimator, see `shared_context`.
 
     Args:
         name: METHOD@SEED or PATH.safetensors.
         estimator: Name of the estimator of the method to train.
+        robot: Variant of the robot to train for.
 
     Returns:
         The checkpoint.
@@ -107,7 +115,7 @@ def load_init_checkpoint(name: str, estimator: str) -> Checkpoint:
         CheckpointError: It has a different estimator; and see `load`.
         UnknownNameError: There is no such checkpoint.
     """
-    found = load(find(name))
+    found = load(find(name, robot))
     theirs = METHODS[found.card.method]
     if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(
@@ -128,15 +136,16 @@ def shared_context(init: Estimator, mine: Estimator) -> int:
         Number of shared columns.
     """
     if type(init) is type(mine):
-        return mine.context_dim
+        return min(init.context_dim, mine.context_dim)  # an oracle's first columns are always the same
     return inputs.VELOCITY if init.context_dim and mine.trainable else 0
 
 
-def load_teacher(name: str) -> Checkpoint:
+def load_teacher(name: str, robot: str) -> Checkpoint:
     """Load a checkpoint whose action depends on the current state only.
 
     Args:
         name: METHOD@SEED or PATH.safetensors.
+        robot: Variant of the robot to train for.
 
     Returns:
         The checkpoint.
@@ -145,7 +154,7 @@ def load_teacher(name: str) -> Checkpoint:
         CheckpointError: Its context is estimated from a history; and see `load`.
         UnknownNameError: There is no such checkpoint.
     """
-    found = load(find(name))
+    found = load(find(name, robot))
     if found.estimator.trainable:
         raise CheckpointError(
             f"--teacher '{name}' is of {found.card.method}, valid: a method without an estimated context"
@@ -153,11 +162,12 @@ def load_teacher(name: str) -> Checkpoint:
     return found
 
 
-def find(name: str) -> Path:
+def find(name: str, robot: str) -> Path:
     """Find the file of a checkpoint.
 
     Args:
         name: METHOD@SEED of a checkpoint of this package, or PATH.safetensors.
+        robot: Variant of the robot, of which each has checkpoints of its own.
 
     Returns:
         The safetensors file.
@@ -167,16 +177,17 @@ def find(name: str) -> Path:
     """
     if name.endswith(".safetensors"):
         return Path(name)
-    path = CHECKPOINTS / f"{name}.safetensors"
+    path = CHECKPOINTS / robot / f"{name}.safetensors"
     if not is_file(path):
-        known = available()
+        known = available(robot)
         method = name.partition("@")[0]
         if method not in METHODS:
             raise UnknownNameError("checkpoint", name, known or METHODS, "METHOD@SEED or PATH.safetensors")
-        raise UnknownNameError("checkpoint", name, known, f"{METHODS[method].label}: none trained or shipped")
+        where = f"{METHODS[method].label}: none trained or shipped for the robot '{robot}'"
+        raise UnknownNameError("checkpoint", name, known, where)
     return path
 
 
-def available() -> list[str]:
-    """List the checkpoints of this package as METHOD@SEED."""
-    return sorted(path.stem for path in CHECKPOINTS.glob("*@*.safetensors"))
+def available(robot: str) -> list[str]:
+    """List the checkpoints of this package for a variant of the robot as METHOD@SEED."""
+    return sorted(path.stem for path in (CHECKPOINTS / robot).glob("*@*.safetensors"))

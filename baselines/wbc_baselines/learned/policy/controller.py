@@ -116,7 +116,7 @@ class LearnedController:
         if "term" in self._engine.flow.inputs:
             values["term"] = inputs.history_frame(*measured)
         if "privileged" in self._engine.flow.inputs:
-            values["privileged"] = _privileged(obs)
+            values["privileged"] = _privileged(obs)[:, : self._engine.flow.inputs["privileged"][0]]
         found = self._engine(values)
         self._carried = {name: found[name] for name in self._carried}
         self._action, self._latent = found["action"], found.get("latent")
@@ -176,7 +176,7 @@ def from_checkpoint(robot: Robot, variant: str) -> LearnedController:
         CheckpointError: The checkpoint is damaged or does not fit the robot.
         UnknownNameError: There is no such checkpoint.
     """
-    path = checkpoint.find(variant)
+    path = checkpoint.find(variant, robot.config.variant)
     card, actor, estimator = checkpoint.load(path, robot)
     name = f"learned:{card.method}@{card.seed}"
     return LearnedController(robot, card, Policy(actor, estimator), name, card.sha256, (path,))
@@ -187,14 +187,16 @@ def _tensor(array: NDArray[np.float64]) -> Tensor:
 
 
 def _privileged(obs: Observation) -> Tensor:
-    """The oracle's context (N, 80)."""
+    """The oracle's context (N, 107), of which the first oracles have the first 80 columns."""
     assert obs.privileged is not None and obs.base_pose is not None
     known = obs.privileged
+    delays = np.stack([known.command_delay, known.observation_delay, known.odometry_delay], axis=1)
     parts = (
         *(known.base_lin_vel_b, known.joint_torque, known.joint_acc, obs.base_pose.pos_w[:, 2]),
         *(known.ee_lin_vel_b, known.ee_ang_vel_b, known.foot_pos_b.reshape(-1, 6)),
         *(known.kp_scale, known.kd_scale, known.base_mass, known.friction),
-        known.foot_force_w.reshape(-1, 6),
+        *(known.foot_force_w.reshape(-1, 6), known.payload, known.payload_offset, known.motor_strength),
+        *(known.joint_offset, known.imu_tilt, delays, known.odometry_error_b),
     )
     return inputs.privileged(*map(_tensor, parts))
 

@@ -45,7 +45,7 @@ COMMAND_LAYOUT: Layout = (  # Source: paper, eq. 1
 # Source: paper, section III-C
 HISTORY_LAYOUT: Layout = (_ANG_VEL, _GRAVITY, _JOINT_POS, _JOINT_VEL, _TORQUE, _EE_POS, _EE_ROT)
 NEXT_OBSERVATION_LAYOUT: Layout = (_ANG_VEL, _GRAVITY, _JOINT_POS, _JOINT_VEL, _EE_POS, _EE_ROT, _FEET)
-PRIVILEGED_LAYOUT: Layout = (  # Source: paper, section III-A, what the critic additionally receives
+PAPER_PRIVILEGED_LAYOUT: Layout = (  # Source: paper, section III-A, what the critic additionally receives
     Term("base linear velocity, base frame", 3, "m/s"),
     _TORQUE,
     Term("joint accelerations over the last control period", NUM_JOINTS, "rad/s^2"),
@@ -58,6 +58,16 @@ PRIVILEGED_LAYOUT: Layout = (  # Source: paper, section III-A, what the critic a
     Term("mass added to the base", 1, "kg"),
     Term("friction coefficient", 1, "1"),
     Term("ground forces on left and right sole, world frame", 6, "N"),
+)
+PRIVILEGED_LAYOUT: Layout = (  # and the disturbances of `wbc_bench.episodes.protocol.Randomization` since
+    *PAPER_PRIVILEGED_LAYOUT,
+    Term("payload in the hand", 1, "kg"),
+    Term("place of the payload from the end-effector, in the frame of its link", 3, "m"),
+    Term("motor strength", 1, "1"),
+    Term("errors of the encoders", NUM_JOINTS, "rad"),
+    Term("tilt of the IMU about x and y", 2, "rad"),
+    Term("delays of commands, observations and odometry", 3, "s"),
+    Term("error of the odometry, base frame", 3, "m"),
 )
 
 
@@ -91,7 +101,7 @@ OBSERVATION = width(OBSERVATION_LAYOUT)
 COMMAND = width(COMMAND_LAYOUT)
 HISTORY_FRAME = width(HISTORY_LAYOUT)
 NEXT_OBSERVATION = width(NEXT_OBSERVATION_LAYOUT)
-PRIVILEGED = width(PRIVILEGED_LAYOUT)
+PAPER_PRIVILEGED, PRIVILEGED = width(PAPER_PRIVILEGED_LAYOUT), width(PRIVILEGED_LAYOUT)
 VELOCITY, LATENT = 3, 64  # of the context z = (v, xi). Source: paper, Table I
 CONTEXT_MAX = VELOCITY + LATENT
 CONTEXT_LAYOUT: Layout = (
@@ -102,7 +112,7 @@ CONTEXT_LAYOUT: Layout = (
 )
 # Source: paper, Table I and section III
 assert (OBSERVATION, COMMAND, HISTORY_FRAME, NEXT_OBSERVATION, CONTEXT_MAX) == (58, 9, 57, 49, 67)
-assert PRIVILEGED == 80
+assert PAPER_PRIVILEGED == 80
 
 LAYOUTS: dict[str, Layout] = {
     "observation": OBSERVATION_LAYOUT,
@@ -181,8 +191,15 @@ def privileged(
     base_mass: "Tensor",
     friction: "Tensor",
     foot_force_w: "Tensor",
+    payload: "Tensor",
+    payload_offset: "Tensor",
+    motor_strength: "Tensor",
+    joint_offset: "Tensor",
+    imu_tilt: "Tensor",
+    delays: "Tensor",
+    odometry_error_b: "Tensor",
 ) -> "Tensor":
-    """Assemble the privileged vector (N, 80) of true values; base_height, base_mass, friction are (N,).
+    """Assemble the privileged vector (N, 107) of true values; heights, masses, factors of all are (N,).
 
     The end-effector's velocity is relative to the world, not to the base, and expressed in the base frame.
     """
@@ -198,6 +215,8 @@ def privileged(
             feet_b,
         ),
         *(kp_scale, kd_scale, base_mass[..., None], friction[..., None], foot_force_w),
+        *(payload[..., None], payload_offset, motor_strength[..., None], joint_offset, imu_tilt),
+        *(delays, odometry_error_b),
     )
 
 

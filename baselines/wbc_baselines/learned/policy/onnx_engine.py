@@ -8,9 +8,7 @@ import onnxruntime
 import torch
 from torch import Tensor
 
-from wbc_baselines.learned.policy.card import CheckpointError, decode_card
-from wbc_baselines.learned.policy.estimators import make_estimator
-from wbc_baselines.learned.policy.methods import METHODS
+from wbc_baselines.learned.policy.card import CheckpointError, decode_card, estimator_of
 from wbc_baselines.learned.policy.policy import flow_of
 from wbc_bench.readers import is_file, read_bytes, reading
 
@@ -43,7 +41,7 @@ class OnnxEngine:
         if text is None:
             raise CheckpointError(f"'{path}' carries no card, valid: a file that `export` of wbc-bench wrote")
         self.card, self.sha256 = decode_card(text.encode(), str(path)), hashlib.sha256(data).hexdigest()
-        self.flow = flow_of(make_estimator(METHODS[self.card.method].estimator))
+        self.flow = flow_of(estimator_of(self.card))
         self._check_flow(path)
 
     def _check_flow(self, path: Path) -> None:

@@ -11,7 +11,6 @@ from wbc_baselines.learned.policy.inputs import (
     HISTORY,
     HISTORY_FRAME,
     OBSERVATION,
-    PRIVILEGED,
     VELOCITY,
 )
 from wbc_baselines.learned.policy.networks import Actor
@@ -62,5 +61,5 @@ def flow_of(estimator: Estimator) -> Flow:
             inputs["state"] = (estimator.state_dim,)
             outputs.append("state")
     elif estimator.context_dim:
-        inputs["privileged"] = (PRIVILEGED,)
+        inputs["privileged"] = (estimator.context_dim,)
     return Flow(inputs, tuple(outputs))

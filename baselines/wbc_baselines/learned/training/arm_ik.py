@@ -59,6 +59,11 @@ class ArmKinematics:
         linear = torch.linalg.cross(axis, pos[:, None] - anchor)
         return pos, rot[-1] @ self._rot, torch.cat([linear, axis], -1).transpose(1, 2)
 
+    def pose(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Compute position (N, 3) [m] and rotation (N, 3, 3) of the hand in the base frame, see `hand`."""
+        _, _, rot, shift = self._chain(q)
+        return rot[-1] @ self._pos + shift[-1], rot[-1] @ self._rot
+
     def holding_torque(self, q: Tensor, gravity_b: Tensor) -> Tensor:
         """Compute the torques that hold the arm at rest.
 

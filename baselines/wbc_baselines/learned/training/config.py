@@ -107,6 +107,8 @@ class TrainConfig:
     """Interval [control steps] over which noise, pushes and randomization grow linearly from none to the
     protocol's; 0 0 for the protocol's from the beginning, because a policy that first learns to stand
     undisturbed does not learn to step."""
+    undisturbed: float = 0.0
+    """Fraction of the episodes [1] without noise, pushes and randomization."""
     push_interval: tuple[float, float] = (1.5, 3.0)
     """Shortest and longest time between two pushes [s]; 0 0 for the protocol's. Frequent pushes make up for
     the many control steps in which a robot merely stands."""
@@ -203,6 +205,8 @@ class TrainConfig:
             raise TrainingError(
                 f"--disturbance-ramp {begin:g} {end:g}: valid: 0 <= begin < end, or 0 0 for no ramp"
             )
+        if not 0.0 <= self.undisturbed <= 1.0:
+            raise TrainingError(f"--undisturbed {self.undisturbed:g}: valid: 0 to 1")
         least, most = self.push_interval
         if not (0.0 < least <= most or least == most == 0.0):
             raise TrainingError(

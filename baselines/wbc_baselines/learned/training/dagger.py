@@ -8,7 +8,7 @@ online learning".
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -218,8 +218,20 @@ def sample_manifest(
     chosen, push_step = samples.target, samples.push_step.numpy()
     pos = target_set.pos_w[chosen].astype(np.float64)
     none, number = np.full(count, "", dtype=object), np.arange(count)
+    push, delays = samples.push_vel.numpy(), samples.delays.numpy() * protocol.physics.timestep
+    drawn = {name: column.numpy() for name, column in samples.reset._asdict().items()} | {
+        "push_vel": push[..., :2].reshape(count, -1),
+        "push_vel_z": push[..., 2],
+        "push_ang_vel": push[..., 3:].reshape(count, -1),
+        "command_delay": delays[:, 0],
+        "observation_delay": delays[:, 1],
+        "odometry_delay": delays[:, 2],
+        "odometry_drift": np.full(count, protocol.randomization.odometry_drift),
+        "imu_tilt": samples.imu_tilt.numpy(),
+    }
+    columns: dict[str, Any] = neutral(count, push_step.shape[1]) | drawn
     return EpisodeManifest(
-        **neutral(count, push_step.shape[1]),
+        **columns,
         replicate=np.zeros(count, np.int64),
         episode=number,
         stratum=np.array([STRATA[k] for k in target_set.stratum[chosen]], dtype=object),
@@ -229,9 +241,7 @@ def sample_manifest(
         target_pos_w=pos,
         target_quat_w=target_set.quat_w[chosen].astype(np.float64),
         feasible_qpos=np.full((count, 21), np.nan),
-        **{name: column.numpy() for name, column in samples.reset._asdict().items()},
         push_time=np.where(push_step < 0, np.nan, push_step * protocol.control_period),
-        push_vel=samples.push_vel.numpy().reshape(count, -1),
         noise_key=rng.integers(2**63 - 1, size=count),
         noise_scale=np.ones(count),
     )

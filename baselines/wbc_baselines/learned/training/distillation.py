@@ -22,6 +22,7 @@ from wbc_baselines.learned.policy.inputs import COMMAND, OBSERVATION, OBSERVATIO
 from wbc_baselines.learned.training.arm_ik import ArmKinematics
 from wbc_baselines.learned.training.dagger import HUBER_DELTA
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS
+from wbc_baselines.learned.training.precision import fast_products
 from wbc_baselines.learned.training.state_view import ARRIVAL_REFERENCE
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot
 
@@ -74,14 +75,15 @@ class SupervisedUpdate:
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         wanted, losses = self._radians * action, []
-        for _ in range(epochs):
-            for part in torch.randperm(len(wanted), device=wanted.device).chunk(MINI_BATCHES):
-                answer = self._radians * self._actor(observations[part])
-                loss = huber_loss(answer, wanted[part], delta=HUBER_DELTA)
-                self.optimizer.zero_grad()
-                loss.backward()
-                self.optimizer.step()
-                losses.append(loss.detach())
+        with fast_products(wanted.device):
+            for _ in range(epochs):
+                for part in torch.randperm(len(wanted), device=wanted.device).chunk(MINI_BATCHES):
+                    answer = self._radians * self._actor(observations[part])
+                    loss = huber_loss(answer, wanted[part], delta=HUBER_DELTA)
+                    self.optimizer.zero_grad()
+                    loss.backward()
+                    self.optimizer.step()
+                    losses.append(loss.detach())
         return float(torch.stack(losses).mean())
 
 
@@ -104,14 +106,16 @@ class Distillation:
         """
         self._teacher = teacher.actor.to(action_scale.device)
         self.supervised = SupervisedUpdate(actor, action_scale)
-        self._privileged = teacher.estimator.context_dim > 0
+        self._privileged = teacher.estimator.context_dim  # first columns of the privileged vector
 
     @torch.no_grad()
     def actions(self, observations: TensorDict) -> Tensor:
         """Return the teacher's actions (..., 14) in the given states (...)."""
         seen = observations["policy"]
         if self._privileged:
-            seen = torch.cat([seen, observations["critic"][..., PRIVILEGED_COLUMNS]], -1)
+            seen = torch.cat(
+                [seen, observations["critic"][..., PRIVILEGED_COLUMNS][..., : self._privileged]], -1
+            )
         return self._teacher(seen)
 
     def update(self, observations: TensorDict, progress: float) -> dict[str, float]:

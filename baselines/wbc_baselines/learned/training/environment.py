@@ -9,10 +9,18 @@ from torch import Tensor
 from wbc_baselines.learned.policy import inputs
 from wbc_baselines.learned.policy.methods import Reward
 from wbc_baselines.learned.policy.reference import advance, initial_reference
-from wbc_baselines.learned.training.backends.base import Backend, ResetState, State
+from wbc_baselines.learned.training.arm_ik import ArmKinematics
+from wbc_baselines.learned.training.backends.base import Backend, Reading, ResetState, State
 from wbc_baselines.learned.training.episode_log import EpisodeLog
 from wbc_baselines.learned.training.resets import EpisodeSamples, sample_episodes, scale_disturbances
 from wbc_baselines.learned.training.rewards import Body, Signals, rewards
+from wbc_baselines.learned.training.sensing import (
+    Past,
+    command_age,
+    measure,
+    measured_command,
+    sample_noise,
+)
 from wbc_baselines.learned.training.state_view import (
     CONTACT_FORCE,
     DerivedState,
@@ -26,7 +34,7 @@ from wbc_baselines.learned.training.target_set import TargetSet
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.randomness import stream
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, load_robot
-from wbc_bench.rotations import matrix_from_wxyz
+from wbc_bench.rotations import matrix_from_rotvec, matrix_from_wxyz
 
 PRIVILEGED_COLUMNS = slice(inputs.OBSERVATION + inputs.COMMAND, None)  # of Observations.critic
 
@@ -65,6 +73,7 @@ class Environment:
         reward: Reward,
         seed: int,
         disturbance_scale: float = 1.0,
+        undisturbed: float = 0.0,
     ) -> None:
         """Begin the first episodes.
 
@@ -75,18 +84,28 @@ class Environment:
             reward: Whether the reward is gated or additive.
             seed: Seed of all samples.
             disturbance_scale: Scale in [0, 1] of noise, pushes and randomization.
+            undisturbed: Fraction of the episodes without any of them.
         """
         self.protocol, self.num_envs, self.device = protocol, backend.num_envs, backend.device
         self.curriculum = 1.0
         self.disturbance_scale = disturbance_scale
-        self._backend, self._seed = backend, seed
+        self._backend, self._seed, self._undisturbed = backend, seed, undisturbed
         self._reward: Reward = reward
         self._robot = load_robot(protocol.robot)
         self._target_set, self._body = target_set, body_of(self._robot, self.device)
         self._default_q = self._tensor(self._robot.default_q)
         self._scale = self._tensor(self._robot.action_scale)
         self._noise = torch.zeros(1, self.num_envs, inputs.HISTORY_FRAME, device=self.device)
-        self._at = 0  # row of the noise
+        self._drift = torch.zeros(1, self.num_envs, 3, device=self.device)
+        self._at = 0  # row of the noise and of the drift
+        spread, timestep = protocol.randomization, protocol.physics.timestep
+        # most physics steps of delay: of commands, and of what is measured
+        self._latest, *measured = (
+            round(longest / timestep)
+            for _, longest in (spread.command_delay, spread.observation_delay, spread.odometry_delay)
+        )
+        self._measured_latest = max(measured)
+        self._arm = ArmKinematics(self._robot, self.device)
         self._log = EpisodeLog(protocol, self.device)
         self.begin()
 
@@ -103,12 +122,15 @@ class Environment:
         reset, self._episode = self._take(count)
         self._state = self._backend.reset(torch.arange(count, device=self.device), reset)
         self._derived = self._derive(self._state, self._state, self._episode)
-        rng = stream(self._seed, "training age", number)
-        age = torch.from_numpy(rng.integers(0, self.protocol.num_steps, count)).to(self.device)
+        rng, protocol = stream(self._seed, "training age", number), self.protocol
+        depth = self._latest // protocol.physics.decimation + 2
+        self._commands = Past(depth, self._default_q.repeat(count, 1))
+        self._measured = Past(self._measured_latest + 1, self._measure(self._state, self._episode))
+        age = torch.from_numpy(rng.integers(0, protocol.num_steps, count)).to(self.device)
         self._begin(self._episode, self._derived)
         self._episode.step[:] = age
         self._episode.d_ref[:] = advance(
-            self._episode.d_ref, self._episode.decay * age, self.protocol.control_period
+            self._episode.d_ref, self._episode.decay * age, protocol.control_period
         )
         self.observations = self._observe()
 
@@ -116,7 +138,9 @@ class Environment:
         """Sample as many episodes as there are environments, ahead of their use: one transfer to a GPU."""
         rng = stream(self._seed, "training start", buffer.number)
         protocol = scale_disturbances(self.protocol, buffer.disturbance_scale)
-        samples = sample_episodes(protocol, self._target_set, self.num_envs, rng, buffer.curriculum)
+        samples = sample_episodes(
+            protocol, self._target_set, self.num_envs, rng, buffer.curriculum, self._undisturbed
+        )
         self._buffer = buffer
         self._resets = ResetState(*(column.to(self.device) for column in samples.reset))
         self._episodes = self._fresh_episodes(samples)
@@ -143,6 +167,10 @@ class Environment:
             return torch.zeros(count, dtype=torch.int64, device=self.device)
 
         dynamics = [reset.kp_scale, reset.kd_scale, reset.base_mass[:, None], reset.friction[:, None]]
+        delays = samples.delays * self.protocol.physics.timestep  # [s] as they act
+        hidden = [reset.payload[:, None], reset.payload_offset, reset.motor_strength[:, None]]
+        hidden += [samples.imu_tilt, delays]
+        imu_rot = matrix_from_rotvec(np.pad(samples.imu_tilt.numpy(), ((0, 0), (0, 1))))
         return Episode(
             target_pos_w=self._tensor(targets.pos_w[chosen]),
             target_rot_w=self._tensor(matrix_from_wxyz(targets.quat_w[chosen].astype(np.float64))),
@@ -153,6 +181,12 @@ class Environment:
             push_step=samples.push_step.to(self.device),
             push_vel=samples.push_vel.float().to(self.device),
             dynamics=torch.cat(dynamics, 1).float().to(self.device),
+            hidden=torch.cat(hidden, 1).float().to(self.device),
+            joint_offset=reset.joint_offset.float().to(self.device),
+            imu_rot=self._tensor(imu_rot),
+            delays=samples.delays.to(self.device),
+            noise_scale=samples.noise_scale.float().to(self.device),
+            odometry_error_w=torch.zeros(count, 3, device=self.device),
             step=none(),
             action=torch.zeros(count, NUM_JOINTS, device=self.device),
             d_ref=zero(),
@@ -176,13 +210,15 @@ class Environment:
         derived = self._derive(state, state, episode)
         self._begin(episode, derived)
         self._state.put(ids, state)
+        self._commands.restart(ids, self._default_q)
+        self._measured.restart(ids, self._measure(state, episode))
         for mine, theirs in zip((*self._episode, *self._derived), (*episode, *derived), strict=True):
             mine[ids] = theirs
 
     # ---- one step ------------------------------------------------------------------------------------------
 
     def begin_rollout(self, iteration: int, steps: int) -> None:
-        """Sample the observation noise of a whole rollout at once, on the device.
+        """Sample observation noise and odometry drift of a whole rollout at once, on the device.
 
         Args:
             iteration: Number of the iteration, which identifies the random stream.
@@ -190,10 +226,8 @@ class Environment:
         """
         seed = int(stream(self._seed, "training noise", iteration).integers(2**62))
         generator = torch.Generator(self.device).manual_seed(seed)
-        shape = (steps, self.num_envs, inputs.HISTORY_FRAME)
-        unit = torch.rand(shape, generator=generator, device=self.device)
-        half = self._tensor(noise_half_widths(scale_disturbances(self.protocol, self.disturbance_scale)))
-        self._noise = unit.mul_(2).sub_(1).mul_(half)
+        protocol = scale_disturbances(self.protocol, self.disturbance_scale)
+        self._noise, self._drift = sample_noise(protocol, steps, self.num_envs, generator)
         self._at = 0
         self._backend.check()
 
@@ -210,8 +244,7 @@ class Environment:
         protocol, episode, before = self.protocol, self._episode, self._state
         now = episode.push_step == episode.step[:, None]
         self._backend.push((episode.push_vel * now[..., None]).sum(1))
-        state = self._backend.step(self._default_q + self._scale * action)
-        state = state.where_sound(before)
+        state = self._advance(self._default_q + self._scale * action)
         derived = self._derive(state, before, episode)
         episode.step.add_(1)
         episode.d_ref[:] = advance(episode.d_ref, episode.decay, protocol.control_period)
@@ -229,6 +262,7 @@ class Environment:
         torch.minimum(episode.best_pos_error, derived.pos_error, out=episode.best_pos_error)
         torch.minimum(episode.best_rot_error, derived.rot_error, out=episode.best_rot_error)
         episode.action[:] = action
+        episode.odometry_error_w.add_(self._drift[self._at] * episode.noise_scale[:, None])
         episode.episode_return.add_(reward)
         self._log.add(terms, gates, derived, episode, done, time_out, state.diverged)
 
@@ -238,11 +272,31 @@ class Environment:
         self._at += 1
         return Step(self.observations, reward, done, time_out, now.any(1))
 
+    def _advance(self, command: Tensor) -> State:
+        """Apply commands (N, 14) [rad] for one control period, as late and as far off as episodes say."""
+        episode, decimation, before = self._episode, self.protocol.physics.decimation, self._state
+        self._commands.push(command)
+        parts = decimation if self._latest or self._measured_latest else 1
+        delay = episode.delays[:, 0]
+        acting = [self._commands.at(command_age(k, delay, decimation)) for k in range(parts)]
+        readings, state = self._backend.step(torch.stack(acting) - episode.joint_offset)
+        state = state.where_sound(before)
+        for reading in (*readings, state):
+            self._measured.push(self._measure(reading, episode))
+        return state
+
+    def _measure(self, reading: Reading | State, episode: Episode) -> Tensor:
+        return measure(reading, episode, self._default_q, self._arm)
+
     def _derive(self, state: State, before: State, episode: Episode) -> DerivedState:
         return derive_state(state, before, episode, self._default_q, self.protocol.control_period)
 
     def _observe(self) -> Observations:
-        return observe(self._state, self._derived, self._episode, self._noise[self._at])
+        episode = self._episode
+        frame = self._measured.at(episode.delays[:, 1])[:, : inputs.HISTORY_FRAME]
+        frame = frame + self._noise[self._at] * episode.noise_scale[:, None]
+        command = measured_command(self._measured.at(episode.delays[:, 2]), episode)
+        return observe(self._state, self._derived, episode, frame, command)
 
     def _signals(self, state: State, derived: DerivedState, action: Tensor, terminated: Tensor) -> Signals:
         episode = self._episode
@@ -294,6 +348,8 @@ class Environment:
             "derived": self._derived._asdict(),
             "observations": self.observations._asdict(),
             "buffer": self._buffer._asdict(),
+            "commands": self._commands.values,
+            "measured": self._measured.values,
         }
 
     def load(self, saved: dict) -> None:
@@ -312,17 +368,11 @@ class Environment:
             fields = {k: v.to(self.device) for k, v in saved[name.strip("_")].items()}
             setattr(self, name, kind(**fields))
         self._sample(_EpisodeBuffer(**saved["buffer"]))
+        for past in ("commands", "measured"):
+            getattr(self, f"_{past}").values = saved[past].to(self.device)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.tensor(array, dtype=torch.float32, device=self.device)
-
-
-def noise_half_widths(protocol: EvalProtocol) -> np.ndarray:
-    """Return the half-widths (57,) of the uniform noise on a frame of the window."""
-    noise, joints = protocol.noise, NUM_JOINTS
-    widths = {"base_ang_vel": 3, "gravity": 3, "joint_pos": joints, "joint_vel": joints}
-    widths |= {"joint_torque": joints, "ee_pos": 3, "ee_rot": 6}
-    return np.concatenate([np.full(width, getattr(noise, name)) for name, width in widths.items()])
 
 
 def body_of(robot: Robot, device: torch.device) -> Body:

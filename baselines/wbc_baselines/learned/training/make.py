@@ -20,9 +20,15 @@ def training_protocol(config: TrainConfig) -> EvalProtocol:
         The changed protocol.
 
     Raises:
-        TrainingError: The control period would differ from the protocol's.
+        TrainingError: The control period would differ from the protocol's, or its ground is not level.
     """
     protocol, _ = find_protocol(config.protocol)
+    spread = protocol.randomization
+    if spread.slope or spread.step_height:
+        raise TrainingError(
+            f"--protocol {config.protocol}: its ground has slopes of up to {spread.slope:g} rad and bumps of "
+            f"up to {spread.step_height:g} m, valid for training: level ground"
+        )
     physics = msgspec.structs.replace(
         protocol.physics, timestep=config.timestep, decimation=config.decimation
     )
@@ -67,4 +73,5 @@ def make_environment(config: TrainConfig, target_set: TargetSet | None = None) -
     if target_set is None:
         target_set = read_target_set(find_protocol(config.protocol)[0], requested=config.protocol)
     reward = METHODS[config.method].reward
-    return Environment(protocol, backend, target_set, reward, config.seed, config.disturbance_scale(0))
+    scale = config.disturbance_scale(0)
+    return Environment(protocol, backend, target_set, reward, config.seed, scale, config.undisturbed)

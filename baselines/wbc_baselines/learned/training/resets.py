@@ -11,7 +11,8 @@ from torch import Tensor
 from wbc_baselines.learned.training.backends.base import ResetState
 from wbc_baselines.learned.training.target_set import TargetSet
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol, Push, WorkspaceTargets
-from wbc_bench.episodes.randomization import resting_height
+from wbc_bench.episodes.randomization import nominal, resting_height
+from wbc_bench.evaluation.delays import physics_steps
 from wbc_bench.outcomes import STRATA
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
@@ -28,7 +29,10 @@ class EpisodeSamples(NamedTuple):
     target: NDArray[np.int64]  # (K,) row of the target set
     decay: Tensor  # (K,) [1/s]
     push_step: Tensor  # (K, P) control step before which the push comes, -1 for none
-    push_vel: Tensor  # (K, P, 2) [m/s]
+    push_vel: Tensor  # (K, P, 6) linear in the world [m/s], angular in the base [rad/s]
+    delays: Tensor  # (K, 3) physics steps: of commands, observations and odometry
+    imu_tilt: Tensor  # (K, 2) [rad] rotation vector
+    noise_scale: Tensor  # (K,) 0 for an episode without noise, else 1
 
 
 def stratum_probabilities(protocol: EvalProtocol, curriculum: float) -> Array:
@@ -85,6 +89,7 @@ def sample_episodes(
     count: int,
     rng: np.random.Generator,
     curriculum: float = 1.0,
+    undisturbed: float = 0.0,
 ) -> EpisodeSamples:
     """Sample episodes with the distributions of an evaluation's manifest, on the host.
 
@@ -94,6 +99,8 @@ def sample_episodes(
         count: Number of episodes.
         rng: Random generator.
         curriculum: Completed fraction in [0, 1] of the curriculum over strata.
+        undisturbed: Probability of an episode of the nominal robot at rest, without pushes, noise and
+            randomization.
 
     Returns:
         Samples of `count` episodes.
@@ -112,6 +119,12 @@ def sample_episodes(
         kp_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
         kd_scale=rng.uniform(*spread.gain, (count, NUM_JOINTS)),
     )
+    columns |= dict(
+        payload=rng.uniform(*spread.payload, count),
+        payload_offset=rng.uniform(-spread.payload_offset, spread.payload_offset, (count, 3)),
+        motor_strength=rng.uniform(*spread.motor_strength, count),
+        joint_offset=rng.uniform(-spread.joint_offset, spread.joint_offset, (count, NUM_JOINTS)),
+    )
     probability, target = stratum_probabilities(protocol, curriculum), np.empty(count, dtype=np.int64)
     stratum = rng.choice(len(STRATA), count, p=probability)
     within = rng.random(count)
@@ -119,9 +132,27 @@ def sample_episodes(
         members = np.flatnonzero(target_set.stratum == k)
         mine = stratum == k
         target[mine] = members[(within[mine] * len(members)).astype(np.int64)]
-    reset = ResetState(**{name: torch.from_numpy(column) for name, column in columns.items()})
     decay = rng.uniform(*DECAY, count)
-    return EpisodeSamples(reset, target, *map(torch.from_numpy, (decay, push_step, push_vel)))
+    tilt, direction = rng.uniform(0, spread.gravity_tilt, count), rng.uniform(-np.pi, np.pi, count)
+    ranges = (spread.command_delay, spread.observation_delay, spread.odometry_delay)
+    delays = np.stack([rng.uniform(*limits, count) for limits in ranges], axis=1)
+    calm = rng.random(count) < undisturbed
+    _calm_down(protocol, columns, calm)
+    push_step[calm], push_vel[calm], tilt[calm], delays[calm] = -1, 0.0, 0.0, 0.0
+    reset = ResetState(**{name: torch.from_numpy(column) for name, column in columns.items()})
+    others = (
+        *(decay, push_step, push_vel, physics_steps(delays, protocol.physics.timestep)),
+        *(tilt[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1), (~calm).astype(float)),
+    )
+    return EpisodeSamples(reset, target, *map(torch.from_numpy, others))
+
+
+def _calm_down(protocol: EvalProtocol, columns: dict[str, Array], calm: NDArray[np.bool_]) -> None:
+    """Give the episodes `calm` (K,) the initial state and parameters of undisturbed ones."""
+    if calm.any():
+        still = nominal(protocol, 0, 0)
+        for name, column in columns.items():
+            column[calm] = getattr(still, name)
 
 
 def sample_pushes(
@@ -135,13 +166,17 @@ def sample_pushes(
         rng: Random generator.
 
     Returns:
-        Control steps (count, P) before which a push comes, -1 for none, and velocity changes (count, P, 2)
-        [m/s]. P is MAX_PUSHES, or what fits into an episode where training pushes more often.
+        Control steps (count, P) before which a push comes, -1 for none, and velocity changes (count, P, 6),
+        linear in the world [m/s] and angular in the base [rad/s]. P is MAX_PUSHES, or what fits into an
+        episode where training pushes more often.
     """
     push: Push = protocol.push
     most = max(MAX_PUSHES, int(protocol.episodes.horizon / push.interval[0]))
     time = np.cumsum(rng.uniform(*push.interval, (count, most)), axis=1)
-    velocity = rng.uniform(-push.speed, push.speed, (count, most, 2))
-    none = (time >= protocol.episodes.horizon - push.quiet_end) | (push.speed == 0)
+    speeds = np.repeat([push.speed, push.vertical_speed, push.angular_speed], [2, 1, 3])
+    horizontal = rng.uniform(-push.speed, push.speed, (count, most, 2))
+    others = rng.uniform(-speeds[2:], speeds[2:], (count, most, 4))
+    velocity = np.concatenate([horizontal, others], axis=2)
+    none = (time >= protocol.episodes.horizon - push.quiet_end) | (not push.some)
     step = np.where(none, -1, np.round(time / protocol.control_period)).astype(np.int64)
     return step, np.where(none[..., None], 0.0, velocity)

@@ -43,8 +43,14 @@ class Episode(NamedTuple):
     stratum: Tensor  # (N,)
     decay: Tensor  # (N,) [1/s]
     push_step: Tensor  # (N, P)
-    push_vel: Tensor  # (N, P, 2) [m/s]
+    push_vel: Tensor  # (N, P, 6) linear in the world [m/s], angular in the base [rad/s]
     dynamics: Tensor  # (N, 30) factors of kp and kd, added mass [kg], friction
+    hidden: Tensor  # (N, 10) payload, its place, motor strength, IMU tilt, delays [s]
+    joint_offset: Tensor  # (N, 14) [rad]
+    imu_rot: Tensor  # (N, 3, 3) axes of the IMU in the base frame
+    delays: Tensor  # (N, 3) physics steps: of commands, observations and odometry
+    noise_scale: Tensor  # (N,) 0 for an episode without noise, else 1
+    odometry_error_w: Tensor  # (N, 3) [m] so far
     step: Tensor  # (N,) completed control steps
     action: Tensor  # (N, 14) of the previous step
     d_ref: Tensor  # (N,)
@@ -58,7 +64,7 @@ class Observations(NamedTuple):
     """Inputs of the networks after a step; rows that have just been reset show their new episode."""
 
     policy: Tensor  # (N, 67) noisy observation and command
-    critic: Tensor  # (N, 147) observation without noise, command, privileged
+    critic: Tensor  # (N, 174) observation without noise, command, privileged
     frame: Tensor  # (N, 57) noisy newest frame of the estimators' window
     velocity: Tensor  # (N, 3) [m/s] true, base frame
     next_observation: Tensor  # (N, 49) without noise
@@ -133,23 +139,32 @@ def derive_state(
     )
 
 
-def observe(state: State, derived: DerivedState, episode: Episode, noise: Tensor) -> Observations:
+def true_frame(state: State, derived: DerivedState) -> Tensor:
+    """Assemble the newest frame (N, 57) of the window from true values."""
+    ang_vel, joint_vel = state.qvel[:, 3:6], state.qvel[:, 6:]
+    return inputs.history_frame(
+        ang_vel, derived.gravity_b, derived.joint_pos, joint_vel, state.torque, derived.ee
+    )
+
+
+def observe(
+    state: State, derived: DerivedState, episode: Episode, frame: Tensor, command: Tensor
+) -> Observations:
     """Assemble the inputs of policy, critic and estimator.
 
     Args:
         state: True states of N simulations.
         derived: What `derive_state` made of them.
         episode: Episodes of the simulations.
-        noise: (N, 57) Noise that is added to the newest frame.
+        frame: (N, 57) Newest frame as the sensors show it.
+        command: (N, 9) Target as the odometry places it.
 
     Returns:
-        Inputs of the networks, with noise for the policy and the estimator only.
+        Inputs of the networks; the critic's and the estimator's targets are true, the others measured.
     """
     ang_vel, joint_vel = state.qvel[:, 3:6], state.qvel[:, 6:]
-    true = inputs.history_frame(
-        ang_vel, derived.gravity_b, derived.joint_pos, joint_vel, state.torque, derived.ee
-    )
-    frame = true + noise
+    true = true_frame(state, derived)
+    hidden = episode.hidden
     privileged = inputs.privileged(
         derived.lin_vel_b,
         state.torque,
@@ -163,9 +178,11 @@ def observe(state: State, derived: DerivedState, episode: Episode, noise: Tensor
         episode.dynamics[:, -2],
         episode.dynamics[:, -1],
         state.foot_force_w.flatten(1),
+        *(hidden[:, 0], hidden[:, 1:4], hidden[:, 4], episode.joint_offset, hidden[:, 5:7], hidden[:, 7:10]),
+        odometry_error_b=in_base(state, episode.odometry_error_w),
     )
     return Observations(
-        policy=torch.cat([_observation(frame, episode), derived.command], -1),
+        policy=torch.cat([_observation(frame, episode), command], -1),
         critic=torch.cat([_observation(true, episode), derived.command, privileged], -1),
         frame=frame,
         velocity=derived.lin_vel_b,
@@ -197,6 +214,11 @@ def leg_posture_error(state: State, derived: DerivedState, episode: Episode, tol
     in_place = episode.stratum != STRATA.index("step")
     error = episode.posture - derived.joint_pos[:, :NUM_LEG_JOINTS]
     return torch.where((still & late & in_place)[:, None], error, 0.0)
+
+
+def in_base(state: State, vector_w: Tensor) -> Tensor:
+    """Rotate vectors (N, 3) of the world into the base frame."""
+    return torch.einsum("nji,nj->ni", rotation_from_wxyz(state.qpos[:, 3:7]), vector_w)
 
 
 def rotation_from_wxyz(quat: Tensor) -> Tensor:

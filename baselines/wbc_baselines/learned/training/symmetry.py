@@ -50,20 +50,22 @@ def input_mirror(robot: Robot) -> Mirror:
 
 
 def privileged_mirror(robot: Robot) -> Mirror:
-    """Return the mirror of the privileged vector (..., 80); world-frame entries about the plane y = 0."""
+    """Return the mirror of the privileged vector (..., 107); world-frame entries about the plane y = 0."""
     joints = joint_mirror(robot)
     factors = Mirror(joints.place, np.ones_like(joints.sign))
     feet = Mirror(np.roll(np.arange(6), 3), np.array(2 * POLAR, np.float32))
     mirror = _side_by_side(
         *(POLAR, joints, joints, SAME, POLAR, AXIAL, feet),  # velocity to soles
         *(factors, factors, SAME, SAME, feet),  # gains, mass, friction, forces
+        # payload and its place, motor strength, encoders, IMU about x and y, delays, odometry
+        *(SAME, POLAR, SAME, joints, AXIAL[:2], 3 * SAME, POLAR),
     )
     assert len(mirror.place) == width(PRIVILEGED_LAYOUT)
     return mirror
 
 
 def critic_mirror(robot: Robot) -> Mirror:
-    """Return the mirror of the critic's inputs without a context (..., 147)."""
+    """Return the mirror of the critic's inputs without a context (..., 174)."""
     return _side_by_side(input_mirror(robot), privileged_mirror(robot))
 
 

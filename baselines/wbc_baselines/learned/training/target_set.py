@@ -136,7 +136,7 @@ def read_target_set(
     command = f"wbc-train targets --protocol {quote(requested or protocol.name)}"
     if path is not None:
         command += f" --path {quote(str(path))}"
-    path = path or TARGET_SETS / f"{protocol.name}.parquet"
+    path = path or _shipped(protocol)
     if not path.exists():
         raise ManifestError(f"target set '{path}' does not exist: make it with `{command}`")
     table = read_parquet(path, "target set", ManifestError, COLUMNS)
@@ -156,6 +156,14 @@ def read_target_set(
     for problem in _mistakes(found):
         raise ManifestError(f"target set '{path}': {problem}: draw it again with `{command}`")
     return found
+
+
+def _shipped(protocol: EvalProtocol) -> Path:
+    """The set of this package for a protocol: protocols of the same targets, robot and limits share one."""
+    for path in sorted(TARGET_SETS.glob("*.parquet")):
+        if (pq.read_schema(path).metadata or {}).get(b"digest", b"").decode() == digest(protocol):
+            return path
+    return TARGET_SETS / f"{protocol.name}.parquet"
 
 
 _WIDTHS = {"pos_w": 3, "quat_w": 4, "witness_qpos": 21}

@@ -63,9 +63,9 @@ def measure(
     from wbc_baselines.learned.training.make import make_environment
     from wbc_baselines.learned.training.trainer import Trainer, duration
 
-    available = checkpoint.available()
-    ours = {m: name for m in methods if (name := f"{m}@{config.seed}") in available}
     protocol, path = find_protocol(config.protocol)
+    available = checkpoint.available(protocol.robot.variant)
+    ours = {m: name for m in methods if (name := f"{m}@{config.seed}") in available}
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, episodes)
     control_steps = config.num_envs * config.num_steps_per_env
     training: dict[str, list[tuple[float, float]]] = {method: [] for method in methods}

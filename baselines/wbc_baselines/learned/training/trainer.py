@@ -32,6 +32,7 @@ from wbc_baselines.learned.training.distillation import (
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment, Step
 from wbc_baselines.learned.training.estimator_rollout import EstimatorRollout
 from wbc_baselines.learned.training.ppo import ScheduledPPO
+from wbc_baselines.learned.training.precision import fast_products
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.robot import load_robot
 
@@ -59,16 +60,16 @@ class Trainer:
         self.method = METHODS[config.method]
         self.iteration, self.samples = 0, 0  # samples: control steps so far
         self.device = environment.device
-        self._origins = tuple(checkpoint.identity(name) for name in (config.init_checkpoint, config.teacher))
+        variant = environment.protocol.robot.variant
+        origins = config.init_checkpoint, config.teacher
+        self._origins = tuple(checkpoint.identity(name, variant) for name in origins)
         if config.backend == "cpu":
             torch.set_num_threads(config.threads)
-        else:
-            torch.set_float32_matmul_precision("high")
         torch.manual_seed(_key(config.seed, "weights"))
         self.estimator = make_estimator(self.method.estimator).to(self.device)
         init = None
         if config.init_checkpoint:
-            init = checkpoint.load_init_checkpoint(config.init_checkpoint, self.method.estimator)
+            init = checkpoint.load_init_checkpoint(config.init_checkpoint, self.method.estimator, variant)
             if type(init.estimator) is type(self.estimator):
                 self.estimator.load_state_dict(init.estimator.state_dict())
                 for name, count in self.estimator.named_buffers():
@@ -82,7 +83,8 @@ class Trainer:
         scale = torch.tensor(robot.action_scale, dtype=torch.float32, device=self.device)
         self.distillation = None
         if config.teacher:
-            self.distillation = Distillation(checkpoint.load_teacher(config.teacher), self.ppo.actor, scale)
+            teacher = checkpoint.load_teacher(config.teacher, variant)
+            self.distillation = Distillation(teacher, self.ppo.actor, scale)
         self.auxiliary_losses: dict[str, ArmIKLoss | PostureLoss] = {}  # by the setting of their interval
         if config.arm_ik_loss[1]:
             self.auxiliary_losses["arm_ik_loss"] = ArmIKLoss(robot, self.ppo.actor, scale)
@@ -175,7 +177,8 @@ class Trainer:
         for t in range(config.num_steps_per_env):
             if rollout:
                 rollout.before(t, self._history.window, self._start, environment.observations.velocity)
-            action = ppo.act(observations)
+            with fast_products(self.device):
+                action = ppo.act(observations)
             if teacher:  # with the policy's exploration
                 noise = action - ppo.transition.distribution_params[0]  # type: ignore[index]
                 action = torch.where(teacher_acts[:, None], teacher.actions(observations) + noise, action)
@@ -196,7 +199,8 @@ class Trainer:
         ppo.critic_only = self.iteration < config.critic_warmup_iterations or progress < 1
         ppo.num_learning_epochs = config.num_learning_epochs if progress == 1 else 1
         states = ppo.storage.observations
-        losses = ppo.update()
+        with fast_products(self.device):
+            losses = ppo.update()
         if self.distillation and progress < 1:
             losses |= self.distillation.update(states, progress)
         elif self.distillation and (weight := config.kickstart_weight(self.samples)):
@@ -220,9 +224,10 @@ class Trainer:
         config, sums = self.config, {}
         for batch in rollout.batches(config.estimator_updates):
             noise = torch.randn(*batch.start.shape, self.estimator.latent_dim, device=self.device)
-            losses = self.estimator.losses(batch, noise)
-            self.optimizer.zero_grad()
-            losses["total"].backward()
+            with fast_products(self.device):
+                losses = self.estimator.losses(batch, noise)
+                self.optimizer.zero_grad()
+                losses["total"].backward()
             torch.nn.utils.clip_grad_norm_(self.estimator.parameters(), config.max_grad_norm)
             self.optimizer.step()
             for name, value in losses.items():
@@ -243,7 +248,8 @@ class Trainer:
         """Sample the context of the current windows. Source: paper, eq. estimated_context."""
         self._state_before = self._state
         noise = torch.randn(len(self._state), self.estimator.latent_dim, device=self.device)
-        context, self._state = self.estimator.step(self._history.window, self._state, noise)
+        with fast_products(self.device):
+            context, self._state = self.estimator.step(self._history.window, self._state, noise)
         return context
 
     def _observations(self) -> TensorDict:

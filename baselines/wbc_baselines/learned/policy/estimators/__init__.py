@@ -9,7 +9,7 @@ from wbc_baselines.learned.policy.estimators.transformer import Transformer
 from wbc_baselines.learned.policy.estimators.transformer_gru import TransformerGRU
 from wbc_bench.errors import UnknownNameError
 
-__all__ = ["ESTIMATORS", "Batch", "Estimator", "make_estimator"]
+__all__ = ["ESTIMATORS", "Batch", "Estimator", "Oracle", "make_estimator"]
 
 ESTIMATORS: dict[str, type[Estimator]] = {
     "none": NoContext,

@@ -23,7 +23,7 @@ class Estimator(nn.Module):
     the noise for a sampled latent; `trainable` states whether `losses` exists.
     """
 
-    context_dim: ClassVar[int] = 0
+    context_dim: int = 0
     state_dim: ClassVar[int] = 0
     latent_dim: ClassVar[int] = 0
     trainable: ClassVar[bool] = False

@@ -22,6 +22,10 @@ class ResetState(NamedTuple):
     leg_qd: Tensor  # (K, 8) [rad/s]
     kp_scale: Tensor  # (K, 14)
     kd_scale: Tensor  # (K, 14)
+    payload: Tensor  # (K,) [kg]
+    payload_offset: Tensor  # (K, 3) [m]
+    motor_strength: Tensor  # (K,)
+    joint_offset: Tensor  # (K, 14) [rad]
 
 
 class State(NamedTuple):
@@ -50,6 +54,14 @@ class State(NamedTuple):
             lost = self.diverged.reshape(-1, *[1] * (now.ndim - 1))
             rows.append(torch.where(lost, then, now))
         return State(*rows)._replace(diverged=self.diverged)
+
+
+class Reading(NamedTuple):
+    """What motors, encoders and IMU of N simulations measure; the first fields of a `State`."""
+
+    qpos: Tensor  # (N, 21)
+    qvel: Tensor  # (N, 20)
+    torque: Tensor  # (N, 14)
 
 
 class Columns(NamedTuple):
@@ -109,12 +121,20 @@ class Backend(Protocol):
         """Reset the simulations `ids` (K,) and return their state, K rows."""
         ...
 
-    def push(self, velocity_w: Tensor) -> None:
-        """Add velocities (N, 2) [m/s] to the horizontal velocity of the base; 0 for no push."""
+    def push(self, velocity: Tensor) -> None:
+        """Add to the base's velocity (N, 6), in the world [m/s] and in the base [rad/s]; 0 for no push."""
         ...
 
-    def step(self, command: Tensor) -> State:
-        """Track joint commands (N, 14) [rad] for one control period and return the new state."""
+    def step(self, commands: Tensor) -> tuple[list[Reading], State]:
+        """Advance by one control period.
+
+        Args:
+            commands: (K, N, 14) [rad] Joint commands for one period, each for an equal part of its physics
+                steps: 1 of them, or one per physics step.
+
+        Returns:
+            What is measured after each command but the last, and the state at the end.
+        """
         ...
 
     def check(self) -> None:

@@ -9,14 +9,22 @@ from mujoco.batch import Batch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.training.backends.base import ResetState, State, columns_of, state_of
+from wbc_baselines.learned.training.backends.base import (
+    Reading,
+    ResetState,
+    State,
+    columns_of,
+    state_of,
+)
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.evaluation.simulation import FATAL_WARNINGS, places_of
+from wbc_bench.episodes.world import PAYLOAD, world_model
+from wbc_bench.evaluation.simulation import FATAL_WARNINGS, places_of, scale_gains
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 _STAGE_NONE, _STAGE_VEL = mujoco.mjtStage.mjSTAGE_NONE, mujoco.mjtStage.mjSTAGE_VEL
 _STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
-_MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
+_GAINS = ("actuator_gainprm", "actuator_biasprm")
+_MODEL = (*_GAINS, "actuator_forcerange", "geom_friction", "body_mass", "body_inertia", "body_ipos")
 
 
 class CpuBackend:
@@ -25,7 +33,7 @@ class CpuBackend:
     def __init__(self, protocol: EvalProtocol, num_envs: int, threads: int) -> None:
         self.num_envs, self.device = num_envs, torch.device("cpu")
         self._robot = robot = load_robot(protocol.robot)
-        self._model = model = robot.model(protocol.physics.timestep)
+        self._model = model = world_model(protocol)
         self._decimation = protocol.physics.decimation
         self._batch = batch = Batch(model, num_envs, nthread=threads, persistent=True)
         self._state = {name: batch.bind(name) for name in _STATE}
@@ -34,6 +42,7 @@ class CpuBackend:
         self._out = outputs | {"actuator_force": batch.bind("actuator_force")}
         self._columns = columns_of(places_of(model), self.device)
         self._base = model.body(robot.facts.base).id
+        self._hand = model.body(PAYLOAD).id if protocol.randomization.payload[1] else None
 
     def reset(self, ids: Tensor, reset: ResetState) -> State:
         rows: NDArray[np.int64] = ids.numpy()
@@ -46,30 +55,42 @@ class CpuBackend:
         qpos[:, 7 : 7 + NUM_LEG_JOINTS] += drawn.leg_q
         qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = drawn.base_vel, drawn.leg_qd
         self._state["qpos"][rows], self._state["qvel"][rows] = qpos, qvel
-        self._state["ctrl"][rows] = default
+        self._state["ctrl"][rows] = default - drawn.joint_offset
         self._batch.forward(rows)
         return self._read(rows)
 
     def _randomise(self, ids: NDArray[np.int64], reset: SimpleNamespace) -> None:
-        """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
+        """Draws of the robot and its ground become model fields, as in the evaluation's simulation."""
         model, fields, base = self._model, self._fields, self._base
         # the larger coefficient of a pair counts, so both sides carry the draw
         fields["geom_friction"][ids, :, 0] = reset.friction[:, None]
         mass = model.body_mass[base] + reset.base_mass
         fields["body_mass"][ids, base] = mass
         fields["body_inertia"][ids, base] = model.body_inertia[base] * (mass / model.body_mass[base])[:, None]
-        fields["actuator_gainprm"][ids, :, 0] = model.actuator_gainprm[:, 0] * reset.kp_scale
-        fields["actuator_biasprm"][ids, :, 1] = model.actuator_biasprm[:, 1] * reset.kp_scale
-        fields["actuator_biasprm"][ids, :, 2] = model.actuator_biasprm[:, 2] * reset.kd_scale
+        gains = {name: np.tile(getattr(model, name), (len(ids), 1, 1)) for name in _GAINS}
+        scale_gains(self._robot, gains.__getitem__, reset.kp_scale, reset.kd_scale)
+        for name, scaled in gains.items():
+            fields[name][ids] = scaled
+        fields["actuator_forcerange"][ids] = model.actuator_forcerange * reset.motor_strength[:, None, None]
+        if self._hand is not None:
+            fields["body_mass"][ids, self._hand] = reset.payload
+            fields["body_ipos"][ids, self._hand] = reset.payload_offset
         self._batch.set_const(ids)
 
-    def push(self, velocity_w: Tensor) -> None:
-        self._state["qvel"][:, :2] += velocity_w.numpy()
+    def push(self, velocity: Tensor) -> None:
+        self._state["qvel"][:, :6] += velocity.numpy()
 
-    def step(self, command: Tensor) -> State:
-        self._state["ctrl"][:] = command.numpy()
-        self._batch.step(nstep=self._decimation, stage=_STAGE_VEL)
-        return self._read(slice(None))
+    def step(self, commands: Tensor) -> tuple[list[Reading], State]:
+        *earlier, last = commands.numpy()
+        nstep, readings = self._decimation // len(commands), []
+        for command in earlier:
+            self._state["ctrl"][:] = command
+            self._batch.step(nstep=nstep, stage=_STAGE_NONE)
+            arrays = self._state["qpos"], self._state["qvel"], self._out["actuator_force"]
+            readings.append(Reading(*(torch.from_numpy(array.astype(np.float32)) for array in arrays)))
+        self._state["ctrl"][:] = last
+        self._batch.step(nstep=nstep, stage=_STAGE_VEL)
+        return readings, self._read(slice(None))
 
     def _read(self, ids: NDArray[np.int64] | slice) -> State:
         def take(array: NDArray[np.float64]) -> Tensor:

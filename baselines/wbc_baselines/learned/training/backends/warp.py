@@ -6,6 +6,7 @@ the start of an episode no contact has been solved yet, so the forces on the sol
 `mujoco.batch` has those of its forward pass.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,19 +18,28 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wbc_baselines.learned.training.backends.base import ResetState, State, columns_of, state_of
+from wbc_baselines.learned.training.backends.base import (
+    Reading,
+    ResetState,
+    State,
+    columns_of,
+    state_of,
+)
 from wbc_baselines.learned.training.config import TrainingError
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.evaluation.simulation import places_of
+from wbc_bench.episodes.world import PAYLOAD, world_model
+from wbc_bench.evaluation.simulation import places_of, scale_gains
 from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
 
 # Per world: 8 contacts of the soles, and room for what meets in a fall; 3 rows a contact, 14 joint limits.
 CONTACTS, ROWS = 32, 128
-_MODEL = ("geom_friction", "body_mass", "body_inertia", "actuator_gainprm", "actuator_biasprm")
-# What follows from the base's mass, by `mj_setConst`; tabulated, since mujoco_warp finds it for all worlds at
-# once or for none. Between two of KNOTS masses it is linear to 1e-5.
+_GAINS = ("actuator_gainprm", "actuator_biasprm")
+_MODEL = (*_GAINS, "actuator_forcerange", "geom_friction", "body_mass", "body_inertia", "body_ipos")
+# What follows from the masses of base and payload, by `mj_setConst`; tabulated, since mujoco_warp finds it
+# for all worlds at once or for none. Between two of KNOTS masses it is linear to 1e-5. The payload's place in
+# the hand is left out: it changes no mass, only how soft contacts and limits are.
 _DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0")
-KNOTS = 65
+KNOTS, PAYLOAD_KNOTS = 65, 9
 _STATE = ("qpos", "qvel", "ctrl", "qacc_warmstart", "time")
 # Overflows of what all worlds share, and of one world's memory; the others cost accuracy at most.
 _OF_ALL = int(mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE)
@@ -46,7 +56,7 @@ class WarpBackend:
         self.num_envs, self.device = num_envs, torch.device(device)
         self._robot = load_robot(protocol.robot)
         self._decimation = protocol.physics.decimation
-        self._host = model = self._robot.model(protocol.physics.timestep)
+        self._host = model = world_model(protocol)
         self._device = wp.get_device(device)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
@@ -67,29 +77,46 @@ class WarpBackend:
         )
         self._mass = float(model.body_mass[self._base])
         self._inertia = self._tensor(model.body_inertia[self._base])
-        self._gain, self._bias = self._tensor(model.actuator_gainprm), self._tensor(model.actuator_biasprm)
-        spread = protocol.randomization.base_mass
-        self._lightest, self._span = spread[0], max(spread[1] - spread[0], 1e-9)
-        self._derived = {name: self._tensor(a) for name, a in self._tabulate(spread).items()}
+        fields = (*_GAINS, "actuator_forcerange")
+        self._nominal = {name: self._tensor(getattr(model, name)) for name in fields}
+        spread = protocol.randomization
+        self._hand = model.body(PAYLOAD).id if spread.payload[1] else None
+        self._knots = (
+            np.linspace(*spread.base_mass, KNOTS),
+            np.linspace(0.0, spread.payload[1], PAYLOAD_KNOTS if spread.payload[1] else 1),
+        )
+        self._derived = {name: self._tensor(a) for name, a in self._tabulate(protocol).items()}
         self._graphs: dict[Any, Any] = {}
 
-    def _tabulate(self, spread: tuple[float, float]) -> dict[str, NDArray[np.float64]]:
-        """The fields _DERIVED at KNOTS masses added to the base, evenly over `spread` [kg]."""
-        model = self._robot.model(self._host.opt.timestep)
+    def _tabulate(self, protocol: EvalProtocol) -> dict[str, NDArray[np.float64]]:
+        """The fields _DERIVED at the knots of the base's added mass and of the payload."""
+        model = world_model(protocol)
         data, base = mujoco.MjData(model), self._base
         mass, inertia = model.body_mass[base], model.body_inertia[base].copy()
         rows: dict[str, list] = {name: [] for name in _DERIVED}
-        for more in np.linspace(*spread, KNOTS):
+        for more, payload in itertools.product(*self._knots):
             model.body_mass[base], model.body_inertia[base] = mass + more, inertia * (1 + more / mass)
+            if self._hand is not None:
+                model.body_mass[self._hand] = payload
             mujoco.mj_setConst(model, data)
             for name in _DERIVED:
                 rows[name].append(getattr(model, name).copy())
-        return {name: np.stack(row) for name, row in rows.items()}
+        shape = tuple(map(len, self._knots))
+        return {name: np.stack(row).reshape(*shape, *row[0].shape) for name, row in rows.items()}
 
     def _advance(self) -> None:
         """One control period, and the kinematics of the new state."""
         for _ in range(self._decimation):
             mjw.step(self._m, self._d)
+        self._place()
+
+    def _advance_once(self) -> None:
+        """One physics step."""
+        mjw.step(self._m, self._d)
+
+    def _finish(self) -> None:
+        """The last physics step of a control period, and the kinematics of the new state."""
+        mjw.step(self._m, self._d)
         self._place()
 
     def _place(self) -> None:
@@ -123,41 +150,54 @@ class WarpBackend:
         qpos[:, 7 : 7 + NUM_LEG_JOINTS] += reset.leg_q
         qvel[:, :6], qvel[:, 6 : 6 + NUM_LEG_JOINTS] = reset.base_vel, reset.leg_qd
         self._state["qpos"][ids], self._state["qvel"][ids] = qpos, qvel
-        self._state["ctrl"][ids] = default
+        self._state["ctrl"][ids] = default - reset.joint_offset
         self._state["qacc_warmstart"][ids] = 0.0
         self._state["time"][ids] = 0.0
         self._launch(self._place)
         # no forward pass for a few worlds of many: the PD law gives its torque
-        torque = self._kp * reset.kp_scale * (default - qpos[:, 7:]) - self._kd * reset.kd_scale * qvel[:, 6:]
-        self._out["actuator_force"][ids] = torque.clamp(-self._effort, self._effort)
+        error = default - reset.joint_offset - qpos[:, 7:]
+        torque = self._kp * reset.kp_scale * error - self._kd * reset.kd_scale * qvel[:, 6:]
+        effort = self._effort * reset.motor_strength[:, None]
+        self._out["actuator_force"][ids] = torque.clamp(-effort, effort)
         self._out["sensordata"][ids] = 0.0
         self._out["overflow"][ids] &= _OF_ALL
         return self._read(ids)
 
     def _randomise(self, ids: Tensor, reset: ResetState) -> None:
-        """Friction, base mass and gains become model fields, as in the evaluation's simulation."""
+        """Draws of the robot and its ground become model fields, as in the evaluation's simulation."""
         fields, base = self._fields, self._base
         # the larger coefficient of a pair counts, so both sides carry the draw
         fields["geom_friction"][ids, :, 0] = reset.friction[:, None]
         mass = self._mass + reset.base_mass
         fields["body_mass"][ids, base] = mass
         fields["body_inertia"][ids, base] = self._inertia * (mass / self._mass)[:, None]
-        fields["actuator_gainprm"][ids, :, 0] = self._gain[:, 0] * reset.kp_scale
-        fields["actuator_biasprm"][ids, :, 1] = self._bias[:, 1] * reset.kp_scale
-        fields["actuator_biasprm"][ids, :, 2] = self._bias[:, 2] * reset.kd_scale
-        place = ((reset.base_mass - self._lightest) / self._span).clamp(0, 1) * (KNOTS - 1)
-        below = place.long().clamp(max=KNOTS - 2)
+        gains = {name: self._nominal[name].repeat(len(ids), 1, 1) for name in _GAINS}
+        scale_gains(self._robot, gains.__getitem__, reset.kp_scale, reset.kd_scale)
+        for name, scaled in gains.items():
+            fields[name][ids] = scaled
+        limits = self._nominal["actuator_forcerange"] * reset.motor_strength[:, None, None]
+        fields["actuator_forcerange"][ids] = limits
+        if self._hand is not None:
+            fields["body_mass"][ids, self._hand] = reset.payload
+            fields["body_ipos"][ids, self._hand] = reset.payload_offset
+        drawn = zip(self._knots, (reset.base_mass, reset.payload), strict=True)
+        row, column = (_place_among(knots, values) for knots, values in drawn)
         for name, table in self._derived.items():
-            part = (place - below).reshape(-1, *[1] * (table.ndim - 1))
-            fields[name][ids] = torch.lerp(table[below], table[below + 1], part)
+            fields[name][ids] = _interpolated(table, row, column)
 
-    def push(self, velocity_w: Tensor) -> None:
-        self._state["qvel"][:, :2] += velocity_w
+    def push(self, velocity: Tensor) -> None:
+        self._state["qvel"][:, :6] += velocity
 
-    def step(self, command: Tensor) -> State:
-        self._state["ctrl"][:] = command
-        self._launch(self._advance)
-        return self._read(slice(None))
+    def step(self, commands: Tensor) -> tuple[list[Reading], State]:
+        readings, one = [], len(commands) == 1
+        for command in commands[:-1]:
+            self._state["ctrl"][:] = command
+            self._launch(self._advance_once)
+            arrays = self._state["qpos"], self._state["qvel"], self._out["actuator_force"]
+            readings.append(Reading(*(array.clone() for array in arrays)))
+        self._state["ctrl"][:] = commands[-1]
+        self._launch(self._advance if one else self._finish)
+        return readings, self._read(slice(None))
 
     def check(self) -> None:
         if int((self._out["overflow"] & _OF_ALL).max()):
@@ -186,3 +226,19 @@ class WarpBackend:
 
     def _tensor(self, array: NDArray[np.float64] | float) -> Tensor:
         return torch.tensor(np.asarray(array), dtype=torch.float32, device=self.device)
+
+
+def _place_among(knots: NDArray[np.float64], values: Tensor) -> Tensor:
+    """Fractional index (K,) of values among knots that are evenly spaced; 0 where there is one knot."""
+    span = max(float(knots[-1] - knots[0]), 1e-9)
+    return ((values - float(knots[0])) / span).clamp(0, 1) * (len(knots) - 1)
+
+
+def _interpolated(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
+    """Values (K, ...) of a table (R, C, ...) at fractional rows and columns (K,), linear between entries."""
+    rows, columns = (size - 1 for size in table.shape[:2])
+    r, c = row.long(), column.long()
+    below, right = (r + 1).clamp(max=rows), (c + 1).clamp(max=columns)
+    down, across = ((place - k).reshape(-1, *[1] * (table.ndim - 2)) for place, k in ((row, r), (column, c)))
+    upper = torch.lerp(table[r, c], table[r, right], across)
+    return torch.lerp(upper, torch.lerp(table[below, c], table[below, right], across), down)
