@@ -9,7 +9,7 @@ episodes=${EPISODES:-20}  # of the evaluation
 # 64 environments x 24 control steps per update, one thread. The policy starts with the weights of the shipped oracle and
 # imitates it in the first half (--distillation-steps); then PPO goes on. The same command resumes an interrupted run.
 wbc-train run --method no_latent --seed 0 --budget "$budget" --num-envs 64 --threads 1 \
-  --distillation-steps 40e3 --kickstart-steps 80e3 --std-legs 0.1 0.05 --std-arm 0.1 0.05 --std-steps 0 80e3 \
+  --distillation-steps 40e3 --kickstart-steps 80e3 --std-legs 0 0.1 80e3 0.05 --std-arm 0 0.1 80e3 0.05 \
   --out "$folder/runs"
 wbc-train status --out "$folder/runs"
 

@@ -226,6 +226,6 @@ def test_the_arm_imitates_beside_ppo_during_its_interval():
 
 
 def test_the_arm_comes_nearer_to_its_inverse_kinematics():
-    t, _ = with_arm_ik(arm_ik_loss=(0.0, 1e6), learning_rate=1e-5, min_learning_rate=1e-5)
+    t, _ = with_arm_ik(arm_ik_loss=(0.0, 1e6), learning_rate=1e-5, min_learning_rate=((0.0, 1e-5),))
     misses = [t.iterate().get("loss/arm_ik", np.nan) for _ in range(60)]
     assert np.nanmean(misses[-10:]) < 0.9 * np.nanmean(misses[:10])

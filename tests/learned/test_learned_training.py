@@ -29,7 +29,7 @@ from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.training import run_folder as runs
 from wbc_baselines.learned.training.backends import cpu
 from wbc_baselines.learned.training.backends.cpu import CpuBackend
-from wbc_baselines.learned.training.campaign import campaign, is_done, runs_of, standing
+from wbc_baselines.learned.training.campaign import is_done, standing
 from wbc_baselines.learned.training.cli import main
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.curves import curves_figure, measured_scores, smooth, write_curves
@@ -173,7 +173,7 @@ def test_the_next_observation_is_of_the_next_step():
 
 
 def test_the_learning_rate_has_a_floor():
-    t = trainer(desired_kl=1e-9, min_learning_rate=2e-4)
+    t = trainer(desired_kl=((0.0, 1e-9),), min_learning_rate=((0.0, 2e-4),))
     t.iterate()
     assert t.ppo.learning_rate >= 2e-4
     assert t.ppo.optimizer.param_groups[0]["lr"] >= 2e-4
@@ -199,7 +199,7 @@ def test_time_outs_are_bootstrapped():
 
 
 def test_noise_and_curriculum_follow_the_samples():
-    t = trainer(curriculum=96.0, std_legs=(0.4, 0.1), std_arm=(1.0, 0.01), std_steps=(48.0, 144.0))
+    t = trainer(curriculum=96.0, std_legs=((48.0, 0.4), (144.0, 0.1)), std_arm=((48.0, 1.0), (144.0, 0.01)))
     noise, ramp = [], []
     while not t.done:
         found = t.iterate()
@@ -223,7 +223,7 @@ def test_disturbances_rise_with_the_samples():
 
 
 def test_policy_and_critic_have_rates_of_their_own():
-    t = trainer(critic_learning_rate=7e-3, min_learning_rate=3e-3)
+    t = trainer(critic_learning_rate=7e-3, min_learning_rate=((0.0, 3e-3),))
     t.iterate()
     rates = [group["lr"] for group in t.ppo.optimizer.param_groups]
     assert rates[0] == t.ppo.learning_rate >= 3e-3 and rates[1] == 7e-3
@@ -235,9 +235,10 @@ def test_policy_and_critic_have_rates_of_their_own():
 @pytest.mark.parametrize(
     ("name", "value", "words"),
     [
-        ("std_steps", (6.0, 4.0), "6 4: valid: 0 <= begin < end"),
-        ("std_legs", (0.1, 0.0), "0.1 0.0: valid: more than 0"),
-        ("std_arm", (-1.0, 0.1), "-1.0 0.1: valid: more than 0"),
+        ("std_legs", ((6.0, 0.1), (4.0, 0.1)), "6 0.1 4 0.1: valid: control steps from 0 on that rise"),
+        ("std_legs", ((0.0, 0.1), (4.0, 0.0)), "0 0.1 4 0: valid: .* a value above 0"),
+        ("std_arm", ((-1.0, 0.1),), "-1 0.1: valid: control steps from 0 on"),
+        ("desired_kl", (), ": valid: control steps"),
     ],
 )
 def test_noise_that_cannot_be_is_refused(name, value, words):
@@ -294,7 +295,11 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
 def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     """Every reward term is logged; a longer budget goes on; other settings are refused by name."""
     folder = RunFolder(tmp_path / TINY.name)
-    schedules = {"std_steps": (0.0, 150.0), "curriculum": 150.0, "disturbance_ramp": (48.0, 144.0)}
+    schedules = {
+        "std_legs": ((0.0, 0.27), (150.0, 0.05)),
+        "curriculum": 150.0,
+        "disturbance_ramp": (48.0, 144.0),
+    }
     config = replace(TINY, **schedules)  # which do not know the budget
     run(replace(config, budget=2 * 48), folder, tensorboard=False)
     assert is_done(folder, replace(config, budget=96)) and not is_done(folder, config)
@@ -503,25 +508,6 @@ def test_a_damaged_resume_file_is_one_line(tmp_path):
         runs.load_resume(t, folder)
 
 
-def test_campaign_trains_what_is_missing(tmp_path):
-    """Every method and seed once; what is done or claimed elsewhere is left alone."""
-    chosen = runs_of(replace(TINY, budget=48), ["no_latent", "oracle"], 2)
-    assert [one.name for one in chosen] == ["no_latent@0", "oracle@0", "no_latent@1", "oracle@1"]
-    elsewhere = RunFolder(tmp_path / "oracle@0")
-    assert elsewhere.take()
-    names = [one.name for one in campaign(chosen, tmp_path, lambda *_: None)]
-    assert names == ["no_latent@0", "no_latent@1", "oracle@1"]
-    elsewhere.release()
-    assert [one.name for one in campaign(chosen, tmp_path, lambda *_: None)] == ["oracle@0"]
-    found = standing(tmp_path)
-    assert [(s.name, s.state, s.samples) for s in found] == [
-        (name, "done", 48) for name in ("no_latent@0", "no_latent@1", "oracle@0", "oracle@1")
-    ]
-    figures = write_curves(tmp_path, tmp_path / "figures")
-    assert {path.suffix for path in figures} == {".png", ".svg"}
-    assert figures[0].read_bytes()[:4] == b"\x89PNG"
-
-
 def test_smoothing_weighs_by_episodes():
     """A moving mean over 3 % of the samples: neighbours far apart stay apart, equal samples pool."""
     rows = [
@@ -603,7 +589,7 @@ def test_mistakes_name_the_valid_values():
 
 
 def test_the_command_line(tmp_path, capsys, monkeypatch):
-    """`wbc-train run`, changed, a campaign, `status`; a mistake is one line and code 2."""
+    """`wbc-train run`, changed, `status`; a mistake is one line and code 2."""
     options = [
         "--budget",
         "4.8e1",
@@ -640,7 +626,7 @@ def test_the_command_line(tmp_path, capsys, monkeypatch):
     main(["status", "--out", str(tmp_path)])
     assert "interrupted" in capsys.readouterr().out  # not done, at the larger budget
     main(more)
-    main(["campaign", "--methods", "oracle", "--seeds", "1", *options])
+    main(["run", "--method", "oracle", *options])
     main(["status", "--out", str(tmp_path)])
     told = capsys.readouterr().out
     assert all(name in told for name in ("no_latent@0", "oracle@0", "done"))

@@ -1,13 +1,16 @@
-"""Training of several methods and seeds at an equal budget, on any number of machines that share a folder."""
+"""Training of several methods and seeds by one recipe, on any number of machines that share a folder."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from wbc_baselines.learned.training.config import TrainConfig
+import msgspec
+
+from wbc_baselines.learned.training.config import TrainConfig, TrainingError
+from wbc_baselines.learned.training.recipe import Recipe
 from wbc_baselines.learned.training.run_folder import RunFolder, run, run_folders
 
+ORACLE = "oracle"
 Progress = Callable[[int, int, str], None]
 
 
@@ -22,15 +25,17 @@ class Standing(NamedTuple):
     falls: float | None
 
 
-def runs_of(base: TrainConfig, methods: Sequence[str], seeds: int) -> list[TrainConfig]:
-    """List the configurations of all methods and seeds, ordered by seed.
+def runs_of(recipe: Recipe, methods: Sequence[str], seeds: int, out: Path) -> list[TrainConfig]:
+    """List the configurations of all methods and seeds, ordered by seed, each seed's oracle first.
 
-    A campaign that is cut short has then trained all methods with the same seeds.
+    A campaign that is cut short has then trained all methods with the same seeds. Every seed has an oracle of
+    its own, from which its other methods are distilled, so that seeds are independent.
 
     Args:
-        base: Settings that all runs share.
-        methods: Methods to train.
+        recipe: Settings of the runs.
+        methods: Methods to train; the oracle is added where others are distilled from it.
         seeds: Number of seeds per method.
+        out: Folder of all runs, where methods find their oracle.
 
     Returns:
         One configuration per run.
@@ -39,9 +44,28 @@ def runs_of(base: TrainConfig, methods: Sequence[str], seeds: int) -> list[Train
         UnknownNameError: There is no such method.
         TrainingError: A setting is out of its range.
     """
-    for method in methods:
-        replace(base, method=method).check()
-    return [replace(base, method=method, seed=seed) for seed in range(seeds) for method in methods]
+    wanted = dict.fromkeys(methods)
+    if recipe.distilled is not None:
+        wanted = {ORACLE: None} | wanted
+    runs = []
+    for seed in range(seeds):
+        oracle = str(RunFolder(out / f"{ORACLE}@{seed}").checkpoint)
+        for method in wanted:
+            if method == ORACLE or recipe.distilled is None:
+                settings = recipe.from_scratch | {"init_checkpoint": "", "teacher": ""}
+            else:
+                settings = recipe.distilled | {"init_checkpoint": oracle, "teacher": oracle}
+            runs.append(_config(recipe, settings | {"method": method, "seed": seed}))
+    for config in runs:
+        config.check()
+    return runs
+
+
+def _config(recipe: Recipe, settings: dict[str, Any]) -> TrainConfig:
+    try:
+        return msgspec.convert(recipe.common | settings, TrainConfig)
+    except msgspec.ValidationError as error:
+        raise TrainingError(f"recipe '{recipe.name}': {error}") from error
 
 
 def campaign(configs: Sequence[TrainConfig], out: Path, progress: Progress) -> Iterator[TrainConfig]:
@@ -57,11 +81,17 @@ def campaign(configs: Sequence[TrainConfig], out: Path, progress: Progress) -> I
     """
     for one in configs:
         folder = RunFolder(out / one.name)
-        if is_done(folder, one) or not folder.take():
+        if is_done(folder, one) or _waits(one) or not folder.take():
             continue
         folder.release()  # `run` takes it again
         run(one, folder, progress)
         yield one
+
+
+def _waits(config: TrainConfig) -> bool:
+    """Whether the oracle of a run is not finished yet, because another process is training it."""
+    checkpoint = Path(config.teacher)
+    return bool(config.teacher) and not RunFolder(checkpoint.parent).finished.exists()
 
 
 def is_done(folder: RunFolder, config: TrainConfig) -> bool:

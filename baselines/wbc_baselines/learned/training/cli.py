@@ -1,5 +1,6 @@
 """The command line of training, `wbc-train COMMAND --help`."""
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -8,6 +9,7 @@ from shlex import quote
 from typing import Annotated
 
 import tyro
+from msgspec.structs import replace
 from tyro.conf import OmitArgPrefixes, subcommand
 
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
@@ -42,28 +44,39 @@ class Run:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Train several methods with several seeds each at an equal budget.
+    """Train several methods with several seeds each by one recipe, from random weights on.
 
     Runs that are finished, or in progress elsewhere, are skipped, so the command can be repeated, and started
     on several machines that share the folder OUT.
     """
 
-    config: OmitArgPrefixes[TrainConfig] = DEFAULTS
+    recipe: str = "paper"
+    """Recipe: one of this package by name, or FILE.toml."""
     methods: tuple[str, ...] = ()
-    """Methods to train, which replace --method; all methods of the study if not given."""
+    """Methods to train; all methods of the study if not given."""
     seeds: int = 3
-    """Number of seeds per method, 0 to SEEDS - 1, which replace --seed."""
+    """Number of seeds per method, 0 to SEEDS - 1."""
+    from_scratch: bool = False
+    """Whether every method is trained from random weights by PPO alone, as the recipe trains the oracle,
+    instead of being distilled from the oracle."""
+    threads: int = 2
+    """Number of CPU threads for the physics and for torch."""
     out: Path = RUNS
     """Folder of all runs."""
 
     def run(self) -> None:
         from wbc_baselines.learned.policy.methods import METHODS
         from wbc_baselines.learned.training.campaign import campaign, runs_of
+        from wbc_baselines.learned.training.recipe import find_recipe
         from wbc_bench.progress import Progress
 
         if self.seeds < 1:
             raise TrainingError(f"--seeds {self.seeds}: valid: 1 or more")
-        chosen = runs_of(self.config, self.methods or tuple(METHODS), self.seeds)
+        recipe = find_recipe(self.recipe)
+        if self.from_scratch:
+            recipe = replace(recipe, distilled=None)
+        chosen = runs_of(recipe, self.methods or tuple(METHODS), self.seeds, self.out)
+        chosen = [dataclasses.replace(one, threads=self.threads) for one in chosen]
         with Progress("steps") as progress:
             for done in campaign(chosen, self.out, progress.update):
                 print(self.out / done.name, flush=True)
@@ -150,13 +163,13 @@ class Bench:
     """Methods to measure, which replace --method."""
 
     def run(self) -> None:
-        from wbc_baselines.learned.training.campaign import runs_of
         from wbc_baselines.learned.training.throughput import measure
         from wbc_bench.results.table import Table
 
         if self.config.backend != "cpu":
             raise TrainingError(f"--backend {self.config.backend}: valid: cpu, whose engine is timed")
-        runs_of(self.config, self.methods, 1)  # refuses what cannot be run
+        for method in self.methods:
+            dataclasses.replace(self.config, method=method).check()
         found = measure(self.config, self.methods)
         cells = [
             (

@@ -1,7 +1,9 @@
 """The configuration of a training run, its schedules and its checks."""
 
 import json
+from bisect import bisect_right
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Literal
 
 from wbc_baselines.learned.policy.methods import METHODS
@@ -9,6 +11,8 @@ from wbc_bench.errors import BenchError, UnknownNameError
 
 ESTIMATOR_UPDATES = 4  # per iteration, where the estimator has as many environments
 FREE = frozenset({"budget", "threads"})  # settings that may differ when a run is resumed
+# Control steps and value of each knot; geometric between knots, constant before the first and after the last
+Schedule = tuple[tuple[float, float], ...]
 
 
 class TrainingError(BenchError):
@@ -42,12 +46,13 @@ class TrainConfig:
     """Number of mini-batches into which PPO divides a rollout in each pass."""
     learning_rate: float = 1e-4
     """Initial learning rate of the policy [1]; it is then adapted to reach `desired_kl`."""
-    min_learning_rate: float = 2e-5
-    """Lower bound [1] of the adapted learning rate of the policy."""
+    min_learning_rate: Schedule = ((0.0, 2e-5),)
+    """Lower bound [1] of the adapted learning rate of the policy, at control steps: STEPS VALUE STEPS VALUE
+    and so on, geometric in between."""
     critic_learning_rate: float = 5e-4
     """Constant learning rate of the critic [1]."""
-    desired_kl: float = 0.03
-    """KL divergence per update [nat] that the adapted learning rate aims at."""
+    desired_kl: Schedule = ((0.0, 0.03),)
+    """KL divergence per update [nat] that the adapted learning rate aims at, at control steps."""
     gamma: float = 0.99
     """Discount factor per control step [1]."""
     lam: float = 0.95
@@ -88,14 +93,12 @@ class TrainConfig:
     critic_warmup_iterations: int = 15
     """Number of first iterations in which only the critic is updated, because it knows nothing yet about the
     returns of the initial policy; 0 for none."""
-    std_legs: tuple[float, float] = (0.27, 0.05)
-    """Initial and final standard deviation of the leg actions [1], in units of the action scale. At 0.14 a
-    policy keeps standing still and falls when pushed; at 0.27 it learns to step, see docs/training-log.md."""
-    std_arm: tuple[float, float] = (0.4, 0.05)
-    """Initial and final standard deviation of the arm actions [1], in units of the action scale."""
-    std_steps: tuple[float, float] = (36e6, 58e6)
-    """Interval [control steps] over which both standard deviations decay exponentially from their initial to
-    their final value. Most of the successful episodes appear during this decay."""
+    std_legs: Schedule = ((36e6, 0.27), (58e6, 0.05))
+    """Standard deviation of the leg actions [1] in units of the action scale, at control steps. At 0.14 a
+    policy keeps standing still and falls when pushed; at 0.27 it learns to step, see docs/training-log.md.
+    Most of the successful episodes appear while it decays."""
+    std_arm: Schedule = ((36e6, 0.4), (58e6, 0.05))
+    """Standard deviation of the arm actions [1] in units of the action scale, at control steps."""
     timestep: float = 0.01
     """Physics step [s] in training; an evaluation always uses the protocol's."""
     decimation: int = 2
@@ -150,9 +153,7 @@ class TrainConfig:
 
     def std(self, samples: int) -> tuple[float, float]:
         """Standard deviations of the leg and the arm actions."""
-        progress = _progress(samples, *self.std_steps)
-        legs, arm = (first * (last / first) ** progress for first, last in (self.std_legs, self.std_arm))
-        return legs, arm
+        return value_at(self.std_legs, samples), value_at(self.std_arm, samples)
 
     def disturbance_scale(self, samples: int) -> float:
         """Scale in [0, 1] of noise, pushes and randomization."""
@@ -190,16 +191,18 @@ class TrainConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise TrainingError(f"{option(name)} {value}: valid: 1 or more")
-        for name, values in (
-            ("distillation_steps", (self.distillation_steps,)),
-            ("std_legs", self.std_legs),
-            ("std_arm", self.std_arm),
-        ):
-            if not min(values) > 0:
-                raise TrainingError(f"{option(name)} {' '.join(map(str, values))}: valid: more than 0")
-        begin, end = self.std_steps
-        if not 0.0 <= begin < end:
-            raise TrainingError(f"--std-steps {begin:g} {end:g}: valid: 0 <= begin < end")
+        if not self.distillation_steps > 0:
+            raise TrainingError(f"--distillation-steps {self.distillation_steps:g}: valid: more than 0")
+        for name in ("std_legs", "std_arm", "min_learning_rate", "desired_kl"):
+            knots = getattr(self, name)
+            steps, values = [step for step, _ in knots], [value for _, value in knots]
+            rising = all(a < b for a, b in pairwise(steps))
+            if not (knots and rising and steps[0] >= 0 and min(values) > 0):
+                given = " ".join(f"{number:g}" for knot in knots for number in knot)
+                raise TrainingError(
+                    f"{option(name)} {given}: valid: control steps from 0 on that rise, each followed by a "
+                    "value above 0"
+                )
         begin, end = self.disturbance_ramp
         if not (0.0 <= begin < end or begin == end == 0.0):
             raise TrainingError(
@@ -245,6 +248,15 @@ class TrainConfig:
     def estimator_updates(self) -> int:
         """Number of updates of the estimator per iteration."""
         return _with_updates(asdict(self))["estimator_mini_batches"]
+
+
+def value_at(schedule: Schedule, samples: float) -> float:
+    """Return the value of a schedule after `samples` control steps."""
+    after = bisect_right(schedule, samples, key=lambda knot: knot[0])
+    if after in (0, len(schedule)):
+        return schedule[max(after - 1, 0)][1]
+    (begin, first), (end, last) = schedule[after - 1 : after + 1]
+    return first * (last / first) ** ((samples - begin) / (end - begin))
 
 
 def option(name: str) -> str:

@@ -17,7 +17,7 @@ from wbc_baselines.learned.policy.checkpoint import Checkpoint, shared_context
 from wbc_baselines.learned.policy.estimators import Estimator
 from wbc_baselines.learned.policy.inputs import ACTIONS
 from wbc_baselines.learned.policy.networks import HIDDEN
-from wbc_baselines.learned.training.config import TrainConfig
+from wbc_baselines.learned.training.config import TrainConfig, value_at
 from wbc_baselines.learned.training.returns import generalized_advantages
 from wbc_baselines.learned.training.symmetry import (
     critic_mirror,
@@ -84,12 +84,13 @@ class ScheduledPPO(PPO):
             max_grad_norm=config.max_grad_norm,
             use_clipped_value_loss=False,
             schedule="adaptive",
-            desired_kl=config.desired_kl,
+            desired_kl=value_at(config.desired_kl, 0),
             device=str(device),
             symmetry_cfg=symmetry_config(robot, device) if config.symmetry_augmentation else None,
         )
         self._config = config
         self.critic_only = False
+        self.min_learning_rate = value_at(config.min_learning_rate, 0)
         groups = [{"params": list(model.parameters())} for model in (actor, critic)]
         self.optimizer = torch.optim.Adam(groups, config.learning_rate)
         # rsl-rl has one rate for both networks, without a lower bound, and no update of the critic alone
@@ -97,7 +98,7 @@ class ScheduledPPO(PPO):
 
     def _set_learning_rates(self, optimizer: torch.optim.Optimizer, *_: object) -> None:
         config = self._config
-        self.learning_rate = max(self.learning_rate, config.min_learning_rate)
+        self.learning_rate = max(self.learning_rate, self.min_learning_rate)
         if self.critic_only:
             self.learning_rate = config.learning_rate  # a fixed policy has no divergence to adapt to
             for parameter in self.actor.parameters():
@@ -105,6 +106,11 @@ class ScheduledPPO(PPO):
         rates = self.learning_rate, config.critic_learning_rate
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
+
+    def follow_schedules(self, samples: int) -> None:
+        """Set what depends on the control steps so far: the bounds of the adapted learning rate."""
+        self.desired_kl = value_at(self._config.desired_kl, samples)
+        self.min_learning_rate = value_at(self._config.min_learning_rate, samples)
 
     def set_std(self, legs: float, arm: float) -> None:
         """Set the standard deviations of the leg and the arm actions, in units of the action scale."""

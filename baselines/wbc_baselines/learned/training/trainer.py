@@ -125,6 +125,7 @@ class Trainer:
         torch.manual_seed(_key(config.seed, "iteration", self.iteration))
         legs, arm = config.std(self.samples)
         ppo.set_std(legs, arm)
+        ppo.follow_schedules(self.samples)
         environment.curriculum = config.curriculum_progress(self.samples)
         environment.disturbance_scale = config.disturbance_scale(self.samples)
         environment.clear_log()
