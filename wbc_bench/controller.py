@@ -11,17 +11,23 @@ from wbc_bench.episodes.protocol import EvalProtocol
 Array = NDArray[np.float64]
 Signal = Literal["proprioception", "ee_pose", "base_pose", "privileged"]
 SIGNALS: tuple[Signal, ...] = get_args(Signal)
+CommandPart = Literal["kp", "kd", "qd", "torque", "action"]
+COMMAND_PARTS: tuple[CommandPart, ...] = get_args(CommandPart)  # what a command may carry beside positions
 DEPLOYABLE: frozenset[Signal] = frozenset({"proprioception", "ee_pose"})  # what the paper's policy may see
 
 
 class ControllerInfo(NamedTuple):
-    """What a controller says of itself; signals it does not declare are not passed to it."""
+    """What a controller says of itself.
+
+    Signals that it does not declare are not passed to it; undeclared parts of a command are refused.
+    """
 
     name: str
     signals: frozenset[Signal]
     control_period: float  # [s]
     source: str  # paper, package or file it comes from
     files: tuple[Path, ...] = ()  # weights and the like: other contents make another controller
+    commands: frozenset[CommandPart] = frozenset()  # parts of `JointCommand` that it uses beside `q`
 
 
 class Proprioception(NamedTuple):
@@ -95,10 +101,20 @@ class Target(NamedTuple):
 
 
 class JointCommand(NamedTuple):
-    """What the 500 Hz PD loop tracks until the next control step."""
+    """What the 500 Hz PD loop tracks until the next control step.
+
+    The motors exert kp (q - joint_pos) + kd (qd - joint_vel) + torque, within the torque limits and the motor
+    model of the robot's variant. Where kp or kd is None it is the variant's, where qd or torque is None it is
+    zero. An episode's random factors on gains multiply commanded gains, too.
+    """
 
     q: Array  # (N, 14) [rad]
     infeasible: NDArray[np.bool_] | None = None  # (N,) steps on which a solver found nothing
+    kp: Array | None = None  # (N, 14) [N m/rad] zero or more
+    kd: Array | None = None  # (N, 14) [N m s/rad] zero or more
+    qd: Array | None = None  # (N, 14) [rad/s]
+    torque: Array | None = None  # (N, 14) [N m] feed-forward
+    action: Array | None = None  # (N, A) [1] normalised by the controller's own scales, for metrics alone
 
 
 @runtime_checkable

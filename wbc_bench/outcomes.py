@@ -48,8 +48,8 @@ class EpisodeBatch:
     outcome: NDArray[np.object_]  # (N,) Outcome
     position_error: NDArray[np.float64]  # (N, T) [m]
     orientation_error: NDArray[np.float64]  # (N, T) [rad]
-    action: NDArray[np.float64]  # (N, T, 14) normalised: (command - default) / scale
-    command: NDArray[np.float64]  # (N, T, 14) [rad]
+    action: NDArray[np.float64]  # (N, T, A) normalised: (command - default) / scale, or the controller's own
+    command: NDArray[np.float64]  # (N, T, 14) [rad] positions; of equal torque where commands are more
     ee_pos_w: NDArray[np.float64]  # (N, T, 3) [m] end-effector in the world
     inside: NDArray[np.bool_]  # (N, T) both errors inside the tolerances
     work: NDArray[np.float64]  # (N, T) [J] positive mechanical work of the motors in a control step

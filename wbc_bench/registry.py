@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from wbc_bench import provenance
-from wbc_bench.controller import SIGNALS, Controller, ControllerInfo, HasVariants, SeededFactory
+from wbc_bench.controller import (
+    COMMAND_PARTS,
+    SIGNALS,
+    Controller,
+    ControllerInfo,
+    HasVariants,
+    SeededFactory,
+)
 from wbc_bench.errors import ControllerError, UnknownNameError
 from wbc_bench.installed import controllers
 from wbc_bench.isolation import blamed
@@ -118,6 +125,10 @@ def _checked(controller: Controller, spec: str) -> Controller:
     for signal in sorted(info.signals):
         if signal not in SIGNALS:
             raise UnknownNameError("signal", signal, SIGNALS, f"declared by controller '{spec}'")
+    for part in sorted(info.commands):
+        if part not in COMMAND_PARTS:
+            where = f"in `info.commands` of controller '{spec}'"
+            raise UnknownNameError("part of a command", part, COMMAND_PARTS, where)
     return controller
 
 

@@ -39,7 +39,12 @@ def record(controller: str, replicate: int, frame: pd.DataFrame, **changes) -> S
     outcome = frame["outcome"].value_counts().to_dict()
     values = {
         **{"protocol": "ablation_v1", "protocol_digest": "d" * 64, "manifest_sha256": "a" * 64},
-        **{"controller": controller, "controller_name": controller, "signals": ["proprioception", "ee_pose"]},
+        **{
+            "controller": controller,
+            "controller_name": controller,
+            "signals": ["proprioception", "ee_pose"],
+            "commands": [],
+        },
         **{"controller_sha256": None, "resolved_controller": None},
         **{"source": "test", "replicate": replicate, "requested": len(frame), "completed": len(frame)},
         **{

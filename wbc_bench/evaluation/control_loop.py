@@ -7,11 +7,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.controller import Controller, JointCommand, ProtocolAware, Target, UsesRandomness
+from wbc_bench.controller import (
+    COMMAND_PARTS,
+    Controller,
+    JointCommand,
+    ProtocolAware,
+    Target,
+    UsesRandomness,
+)
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
 from wbc_bench.evaluation.delays import LateStates, physics_steps
+from wbc_bench.evaluation.drives import Drive, action_of, drive_of, equivalent_position
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation, State
 from wbc_bench.isolation import GlobalRandomness, blamed
@@ -26,8 +34,9 @@ class StepResult(NamedTuple):
     """What happened in one control step."""
 
     stepped: NDArray[np.bool_]  # (N,) episodes that moved, also those that ended by this step
-    q: NDArray[np.float64]  # (N, 14) [rad] commands
+    q: NDArray[np.float64]  # (N, 14) [rad] commands; see `equivalent_position` where they are more than that
     infeasible: NDArray[np.bool_] | None  # (N,) as the controller said
+    action: NDArray[np.float64] | None = None  # (N, A) [1] of a command that is more than positions
 
 
 class ControlLoop:
@@ -62,6 +71,8 @@ class ControlLoop:
         parts = (rows.push_vel, 2), (rows.push_vel_z, 1), (rows.push_ang_vel, 3)
         self._push_vel = np.concatenate([part.reshape(count, -1, width) for part, width in parts], axis=2)
 
+        self._declared = controller.info.commands
+        self._action_width = 0  # of the controller's own actions, once it gave one
         self.step = 0  # control steps taken
         self.ended = np.full(count, RUNNING, dtype=object)  # (N,) how, or RUNNING
         self.active = np.ones(count, dtype=bool)
@@ -105,7 +116,8 @@ class ControlLoop:
     def advance(self, target: Target) -> StepResult:
         """One control step towards a target.
 
-        Raises: ControllerError when the controller fails, or its command has the wrong type or shape.
+        Raises: ControllerError when the controller fails, or its command has the wrong type or shape, or
+            carries what `info.commands` does not declare.
         """
         active = self.active
         with self.blamed("act"):
@@ -120,12 +132,58 @@ class ControlLoop:
         if infeasible is not None:
             infeasible = self._array("`infeasible`", infeasible, "b", (len(active),))
         finite = np.isfinite(q).all(axis=1)
+        drive, action, equivalent = None, None, q
+        if self._declared or any(getattr(command, part) is not None for part in COMMAND_PARTS):
+            drive, action = self._beside_positions(command._replace(q=q))
+            for part in (*(drive or ()), action):
+                finite &= np.isfinite(part).all(axis=1)
+            if drive is not None:
+                equivalent = equivalent_position(q, drive)
         self.ended[active & ~finite] = Outcome.INVALID
         active &= finite
-        result = StepResult(active.copy(), q, infeasible)
+        result = StepResult(active.copy(), equivalent, infeasible, action)
         if active.any():
-            self._move(q, active)
+            self._move(q, active, drive)
         return result
+
+    def _beside_positions(self, command: JointCommand) -> tuple[Drive | None, NDArray[np.float64]]:
+        """What a command carries beside positions, and its action (N, A).
+
+        Raises: ControllerError, a part is not declared, has the wrong type or shape, or is a negative gain.
+        """
+        name, declared, parts = self._controller.info.name, self._declared, {}
+        for part in COMMAND_PARTS:
+            given = getattr(command, part)
+            if given is None:
+                continue
+            if part not in declared:
+                raise ControllerError(
+                    f"controller '{name}' returned `{part}`, which its info does not declare, valid: "
+                    f"ControllerInfo(..., commands=frozenset({{'{part}'}}))"
+                )
+            width = NUM_JOINTS
+            if part == "action":
+                width = self._action_width = self._action_width or (np.shape(given) or (1,))[-1]
+            parts[part] = found = self._array(f"`{part}`", given, "iuf", (len(command.q), width))
+            if part in ("kp", "kd") and (found[self.active] < 0).any():
+                low = found[self.active].min()
+                raise ControllerError(
+                    f"controller '{name}' returned a `{part}` of {low:g} at control step {self.step}, "
+                    "valid: 0 or more"
+                )
+        if "action" in declared and command.action is None:
+            raise ControllerError(
+                f"controller '{name}' returned no `action`, valid: one with every command, since its "
+                "`info.commands` declares it"
+            )
+        command = command._replace(**parts)
+        robot = self.simulation.robot
+        if declared == {"action"}:
+            return None, command.action  # pyright: ignore[reportReturnType]
+        drive = drive_of(command, robot)
+        if command.action is None:
+            return drive, action_of(command.q, drive, declared, robot)
+        return drive, command.action
 
     def blamed(self, method: str) -> AbstractContextManager[None]:
         """Where a method of the controller runs; see `isolation.blamed`."""
@@ -156,12 +214,12 @@ class ControlLoop:
             )
         return found
 
-    def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_]) -> None:
+    def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_], drive: Drive | None) -> None:
         pushed = self.push_step == self.step
         if pushed.any():
             mask = pushed[..., None] & active[:, None, None]
             self.simulation.push(np.where(mask, self._push_vel, 0.0).sum(axis=1))
-        self.state = self.simulation.step(q, active, self._late)
+        self.state = self.simulation.step(q, active, self._late, drive)
         self.step += 1
         for outcome, where in _terminations(self._protocol, self.state):
             self.ended[active & where] = outcome

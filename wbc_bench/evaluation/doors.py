@@ -133,6 +133,7 @@ def evaluate(
         policy_sha256=digest,
         controller=spec,
         signals=sorted(controller.info.signals),
+        commands=sorted(controller.info.commands),
         condition=condition,
         seed=seed,
         requested=count,

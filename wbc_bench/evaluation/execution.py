@@ -190,6 +190,7 @@ class _Run:
                 "controller_name": info.name,
                 "resolved_controller": self._spec,
                 "signals": sorted(info.signals),
+                "commands": sorted(info.commands),
                 "source": info.source,
                 "checkpoint_sha256": getattr(self._controller, "checkpoint_sha256", None),
                 "wall_time_s": round(max(0.0, now - self._started), 3),  # 0 when only the merge was left

@@ -37,6 +37,7 @@ def rollout(
 
     position_error, orientation_error = np.full((2, count, num_steps), np.nan)
     commands = np.full((count, num_steps, NUM_JOINTS), np.nan)
+    actions: NDArray[np.float64] | None = None  # (N, T, A) of commands that are more than positions
     work, slip = np.full((2, count, num_steps), np.nan)
     at_torque_limit, at_speed_limit = np.zeros((2, count, num_steps), dtype=bool)
     ee_pos_w = np.full((count, num_steps, 3), np.nan)
@@ -46,13 +47,17 @@ def rollout(
     if on_step is not None:
         on_step(loop)
     before = loop.state
-    for step, (stepped, q, stuck) in enumerate(loop.run()):
+    for step, (stepped, q, stuck, action) in enumerate(loop.run()):
         if not stepped.any():
             break
         if on_step is not None:
             on_step(loop)
         state = loop.state
         commands[stepped, step] = q[stepped]
+        if action is not None:
+            if actions is None:
+                actions = np.full((count, num_steps, action.shape[1]), np.nan)
+            actions[stepped, step] = action[stepped]
         load = loop.simulation.load
         work[stepped, step] = load.work[stepped]
         at_torque_limit[:, step], at_speed_limit[:, step] = load.at_torque_limit, load.at_speed_limit
@@ -75,7 +80,7 @@ def rollout(
         outcome=outcome,
         position_error=position_error,
         orientation_error=orientation_error,
-        action=loop.simulation.robot.action_of(commands),
+        action=loop.simulation.robot.action_of(commands) if actions is None else actions,
         command=commands,
         ee_pos_w=ee_pos_w,
         inside=inside,

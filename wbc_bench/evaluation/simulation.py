@@ -14,6 +14,7 @@ from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.world import PAYLOAD, world_model
 from wbc_bench.evaluation.delays import LateCommands, LateStates, physics_steps
+from wbc_bench.evaluation.drives import Drive, Motors, rest_of
 from wbc_bench.evaluation.motor_load import LoadMeter, MotorLoad
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, Robot, Scene, load_robot
 from wbc_bench.rotations import matrix_from_rotvec, matrix_from_wxyz, wxyz_from_matrix
@@ -104,8 +105,9 @@ class Simulation:
         self._base = model.body(self.robot.facts.base).id
         self._randomise(model)
         physics = protocol.physics
-        delay = physics_steps(rows.command_delay, physics.timestep)
-        self._commands = LateCommands(delay, physics.decimation, self.robot.default_q)
+        self._delay = physics_steps(rows.command_delay, physics.timestep)
+        self._commands = LateCommands(self._delay, physics.decimation, self.robot.default_q)
+        self._drives: LateCommands | None = None  # of a controller that commands more than positions
         self._qpos, self._qvel, self._ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._site_xpos, self._site_xmat = batch.bind("site_xpos"), batch.bind("site_xmat")
         self._subtree_com = batch.bind("subtree_com")
@@ -160,11 +162,18 @@ class Simulation:
         """Add to the base's velocity: (N, 2), (N, 3) in the world [m/s], or (N, 6), the rest in the base."""
         self._qvel[:, : velocity.shape[1]] += velocity
 
-    def step(self, command: Array, active: NDArray[np.bool_], late: Sequence[LateStates] = ()) -> State:
+    def step(
+        self,
+        command: Array,
+        active: NDArray[np.bool_],
+        late: Sequence[LateStates] = (),
+        drive: Drive | None = None,
+    ) -> State:
         """Let the PD loop track joint commands (N, 14) [rad] for one control period, in active rows only.
 
         Commands act when their episode's delay has passed; the PD loop compares them with the encoders, which
-        are off by the episode's offset. `late` are shown the states at the times that they ask for.
+        are off by the episode's offset. `late` are shown the states at the times that they ask for. Without a
+        `drive` the loop has the variant's gains.
 
         Returns:
             The state at the end of the period.
@@ -173,13 +182,18 @@ class Simulation:
         ids = np.flatnonzero(active)
         chosen = None if len(ids) == len(active) else ids
         self._commands.give(command)
+        self._give(drive)
         self._meter.begin()
         for states in late:
             states.begin_step()
         sampled = set().union(*(states.offsets for states in late)) - {decimation}
         due = self._meter.due
         for begin, end in pairwise(sorted({0, due, decimation} | self._commands.offsets | sampled)):
-            self._ctrl[ids] = (self._commands.acting(begin) - self.rows.joint_offset)[ids]
+            control = self._commands.acting(begin) - self.rows.joint_offset
+            if self._drives is not None:
+                acting = self._drives.acting(begin).reshape(len(active), len(Drive._fields), NUM_JOINTS)
+                control = self._motors.apply(control, Drive(*np.moveaxis(acting, 1, 0)))
+            self._ctrl[ids] = control[ids]
             stage = _STAGE_VEL if end in sampled | {decimation} else _STAGE_NONE
             start = time.process_time()
             self._batch.step(chosen, nstep=end - begin, stage=stage)
@@ -193,6 +207,16 @@ class Simulation:
         for states in late:
             states.sample(decimation, state)
         return state
+
+    def _give(self, drive: Drive | None) -> None:
+        """Keep a drive with the positions of the same command, so that both act equally late."""
+        rest = np.concatenate(rest_of(self.robot))
+        if self._drives is None:
+            if drive is None:
+                return
+            self._drives = LateCommands(self._delay, self.protocol.physics.decimation, rest)
+            self._motors = Motors(self.robot, self._batch.expand, self.rows.kp_scale, self.rows.kd_scale)
+        self._drives.give(rest if drive is None else np.concatenate(drive, axis=1))
 
     @property
     def load(self) -> MotorLoad:

@@ -169,6 +169,7 @@ def facts(controller: Controller, spec: str, source: Source, condition: str, see
         "source_sha256": digest,
         "controller": spec,
         "signals": sorted(controller.info.signals),
+        "commands": sorted(controller.info.commands),
         "condition": condition,
         "seed": seed,
         "counters": dict(source.counters),

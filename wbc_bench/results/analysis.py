@@ -64,6 +64,11 @@ class Evaluated:
         return sorted(set(self.records[0].signals) - PAPER_SIGNALS)
 
     @property
+    def commands(self) -> list[str]:
+        """Parts of its commands beside positions."""
+        return sorted(self.records[0].commands)
+
+    @property
     def rule(self) -> SuccessRule:
         """The one of the protocol, whose digest all records share."""
         return self.records[0].rule

@@ -48,6 +48,7 @@ class DoorRecord(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
     machine: dict[str, str | int | float]
     created: str  # UTC, ISO 8601
+    commands: list[str] = []  # parts of the controller's commands beside positions
 
 
 class DoorRun(NamedTuple):

@@ -74,6 +74,7 @@ class RunRecord(msgspec.Struct, frozen=True, kw_only=True):
     compute_time_s: float  # [s] summed over shards
     max_rss_mib: float  # [MiB] largest resident set of any worker
     created: str  # UTC, ISO 8601
+    commands: list[str] = []  # parts of its commands beside positions, see `JointCommand`
     # A record without the field was made under the v1 protocols, whose rule the defaults are.
     rule: SuccessRule = SuccessRule()
 

@@ -173,6 +173,7 @@ class TrackRecord(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
     machine: dict[str, str | int | float]
     created: str  # UTC, ISO 8601
+    commands: list[str] = []  # parts of the controller's commands beside positions
 
 
 class Track(NamedTuple):

@@ -122,12 +122,14 @@ class Panel:
     def update(self, real_time_factor: float) -> None:
         """Show the present state."""
         session, moment = self._view.session, self._view.session.moment
+        info = session.controller.info
+        more = f" · commands: positions, {', '.join(sorted(info.commands))}" if info.commands else ""
         pace = "–" if np.isnan(real_time_factor) else f"{real_time_factor:.2f} × real time"
         self._state.content = (
             f"**{self._view.doing}** · {moment.time:.1f} s · {pace}\n\n"
             f"position **{moment.position_error * CM:.1f} cm** · "
             f"orientation **{moment.orientation_error * DEG:.1f}°**\n\n"
-            f"sees: {', '.join(sorted(session.controller.info.signals)) or 'nothing'}"
+            f"sees: {', '.join(sorted(info.signals)) or 'nothing'}{more}"
         )
         self._pause.label = "Continue" if self._view.paused else "Pause"
         time, position, orientation = np.array(self._history).T

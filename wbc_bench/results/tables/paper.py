@@ -95,7 +95,9 @@ def paper_columns(paper: Paper | None, spec: str) -> dict[str, stats.Spread] | N
 
 def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bool = False) -> Table:
     """The paper's Table III; errors over episodes that did not terminate, or over all of them."""
-    rows, data, marks = [], [], {}
+    rows, data = [], []
+    reads: dict[str, str] = {}
+    commands: dict[str, str] = {}
     heading = None
     for row in study_rows(study, evaluated):
         group = row.heading if row.heading != heading else ""
@@ -109,9 +111,10 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
         else:
             over = method.not_terminated | terminated
             values = columns_over_replicates(method, over)
-            if method.extra_signals:
-                marks[row.label] = ", ".join(method.extra_signals)
-            label = row.label + (" †" if method.extra_signals else "")
+            label = row.label
+            for mark, found, more in (("†", reads, method.extra_signals), ("‡", commands, method.commands)):
+                if more:
+                    label, found[row.label] = f"{label} {mark}", ", ".join(more)
             count = defined(method, over)
             cells = (spread_text(values[column.name], column.digits) for column in COLUMNS)
             rows.append((group, label, method.counts, str(count), *cells))
@@ -136,9 +139,12 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
         name, title = study.name, f"{study.name}: errors over episodes that did not terminate"
         notes = _paper_notes(study, evaluated)
     notes += names_note({spec: method.name for spec, method in evaluated.items()})
-    if marks:
+    if reads:
+        notes.append(f"† reads more than the paper's policy: {_listed(reads)}.")
+    if commands:
         notes.append(
-            "† reads more than the paper's policy: " + "; ".join(f"{m}: {s}" for m, s in marks.items()) + "."
+            f"‡ commands more than joint positions, and its action variation is that of its own action: "
+            f"{_listed(commands)}."
         )
     columns = [
         "study",
@@ -155,6 +161,10 @@ def paper_table(study: Study, evaluated: Mapping[str, Evaluated], terminated: bo
     return Table(
         name, title, header, tuple(rows), tuple(notes), _integers(pd.DataFrame(data).reindex(columns=columns))
     )
+
+
+def _listed(marks: Mapping[str, str]) -> str:
+    return "; ".join(f"{method}: {what}" for method, what in marks.items())
 
 
 def _flat(values: dict[str, stats.Spread]) -> dict[str, float]:
