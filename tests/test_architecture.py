@@ -16,7 +16,7 @@ LAYERS = (
     ("cli",),
     ("publish", "viewer"),
     ("evaluation",),
-    ("registry",),
+    ("registry", "episode_function"),
     ("sources",),
     ("controller",),
     ("episodes",),

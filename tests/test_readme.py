@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from wbc_bench.cli.main import main
+from wbc_bench.cli.robot import joint_table
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.registry import load_controller
-from wbc_bench.robot import load_robot
+from wbc_bench.robot import RobotConfig, load_robot
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -36,7 +38,7 @@ def test_the_script_of_the_readme_runs(
     assert str(tmp_path) in short
     exec(compile(short, str(README), "exec"), {"__name__": "__main__"})
     printed = capsys.readouterr().out
-    assert "| examples/own_controller.py:GentleArm | 2/2 |" in printed
+    assert "| gentle_arm | 2/2 |" in printed
     assert "## nominal_v2: A = examples/own_controller.py:GentleArm against B = ik:standing\n" in printed
 
 
@@ -74,3 +76,17 @@ def test_all_numbers_of_a_release_agree() -> None:
     assert f"version: {__version__}\n" in citation
     date = re.search(r"date-released: (\S+)", citation)
     assert date and f"## {__version__} - {date[1]}\n" in (ROOT / "CHANGELOG.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("page", "variant"),
+    [("README.md", "paper"), ("docs/robot.md", "paper"), ("docs/robot.md", "limx_adapter")],
+)
+def test_joint_tables_are_those_of_the_facts(page: str, variant: str) -> None:
+    table = joint_table(load_robot(RobotConfig(variant=variant))).markdown()
+    assert "\n".join(table.splitlines()[2:]) in (ROOT / page).read_text()
+
+
+def test_joints_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["robot", "show", "--joints", "--variant", "paper"])
+    assert "| 3 | ankle_L_Joint | -1.15 to 1.57 | 0 | 0.6 | 45 | 0.8 | 40 | 15 |" in capsys.readouterr().out

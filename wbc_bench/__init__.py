@@ -19,10 +19,12 @@ _EXPORTS = {
     "load_controller": "wbc_bench.registry",
     "load_protocol": "wbc_bench.episodes.protocol",
     "load_robot": "wbc_bench.robot",
+    "per_episode": "wbc_bench.episode_function",
 }
 
 if TYPE_CHECKING:
     from wbc_bench.controller import Controller, ControllerInfo, JointCommand, Observation, Target
+    from wbc_bench.episode_function import per_episode
     from wbc_bench.episodes.protocol import EvalProtocol, load_protocol
     from wbc_bench.evaluation.evaluate import Results, compare, evaluate
     from wbc_bench.registry import load_controller
@@ -41,6 +43,7 @@ __all__ = [
     "load_controller",
     "load_protocol",
     "load_robot",
+    "per_episode",
 ]
 
 

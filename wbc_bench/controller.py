@@ -93,6 +93,12 @@ class Observation(NamedTuple):
     privileged: Privileged | None
 
 
+def signal_of(field: str) -> Signal | None:
+    """The signal that has a field of this name; the first of `SIGNALS` where two have it."""
+    kinds = Proprioception, EePose, BasePose, Privileged
+    return next((s for s, kind in zip(SIGNALS, kinds, strict=True) if field in kind._fields), None)
+
+
 class Target(NamedTuple):
     """The end-effector pose asked for, in the instantaneous base frame."""
 

@@ -1,10 +1,11 @@
 """A controller by its name: an installed one, or a class in a module or file of the user."""
 
 import importlib
+import inspect
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -31,10 +32,12 @@ def load_controller(spec: str, robot: Robot) -> Controller:
 
     SPEC is `name` or `name:variant` of an installed controller, or `module:attribute` of a user's own, the
     module importable or a file `path/to/file.py:attribute`. An installed factory is called with
-    `(robot, variant)`, a user's with `(robot)`.
+    `(robot, variant)`, a user's with `(robot)`, or with `(robot, key=value, ...)` for
+    `file.py:attribute?key=value&...`.
 
     Raises:
-        UnknownNameError: no installed controller of that name (with the nearest names).
+        UnknownNameError: no installed controller of that name, or a key that the user's factory does not take
+            (with the nearest names).
         ControllerError: it cannot be imported or built, or declares a signal that does not exist.
     """
     had_torch = "torch" in sys.modules
@@ -47,17 +50,53 @@ def load_controller(spec: str, robot: Robot) -> Controller:
 
 def _load(spec: str, robot: Robot) -> Controller:
     name, _, rest = spec.partition(":")
+    options = {}
     if name in controllers():
         factory, arguments = _installed(controllers()[name], spec), (robot, rest)
     elif rest:
+        attribute, _, query = rest.partition("?")
         with _importing(spec):
-            factory, arguments = _load_attribute(name, rest), (robot,)
+            factory, arguments = _load_attribute(name, attribute), (robot,)
+        options = arguments_of(query, factory, spec)
     else:
         where = "--controller; or give module:attribute"
         raise UnknownNameError("controller", spec, controllers(), where)
     # streams that begin anew: what an import draws is not drawn again where the module is loaded already
     with blamed(f"controller '{spec}' cannot be made"):
-        return _checked(factory(*arguments), spec)
+        return _checked(factory(*arguments, **options), spec)
+
+
+def arguments_of(query: str, factory: Any, spec: str) -> dict[str, Any]:
+    """The arguments in `key=value&...`: integers, numbers, `true`, `false`, other values are text.
+
+    Raises:
+        ControllerError: a part that is no `key=value`, or a key that is given twice.
+        UnknownNameError: a key that the factory does not take.
+    """
+    found: dict[str, Any] = {}
+    for part in query.split("&") if query else ():
+        key, equals, value = part.partition("=")
+        if not equals or not key.isidentifier():
+            raise ControllerError(f"controller '{spec}': argument '{part}', valid: key=value, joined by &")
+        if key in found:
+            raise ControllerError(f"controller '{spec}': argument '{key}' is given twice, valid: once")
+        found[key] = _value(value)
+    with blamed(f"controller '{spec}' cannot be made"):
+        parameters = list(inspect.signature(factory).parameters.values()) if found else []
+    named = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+    known = [p.name for p in parameters[1:] if p.kind in named]  # the robot comes first
+    if not any(parameter.kind == inspect.Parameter.VAR_KEYWORD for parameter in parameters):
+        for key in found:
+            if key not in known:
+                raise UnknownNameError("argument", key, known, f"controller '{spec}'")
+    return found
+
+
+def _value(text: str) -> Any:
+    for parse in (int, float):
+        with suppress(ValueError):
+            return parse(text)
+    return {"true": True, "false": False}.get(text, text)
 
 
 def _installed(point: EntryPoint, spec: str) -> Any:

@@ -242,9 +242,27 @@ def test_a_wrong_shape_names_the_right_one(
 
 def test_a_wrong_control_period(short: EvalProtocol, disturbed: EpisodeManifest) -> None:
     with pytest.raises(
-        ControllerError, match=r"'recorder' runs every 0.01 s, protocol smoke_v1 asks for 0.02 s"
+        ControllerError,
+        match=r"'recorder' runs every 0.03 s, protocol smoke_v1 asks for 0.02 s, valid",
     ):
-        rollout(Recorder(period=0.01), short, disturbed)
+        rollout(Recorder(period=0.03), short, disturbed)
+
+
+@pytest.mark.parametrize("period", [0.004, 0.01, 0.02, 0.06])
+def test_other_control_periods(short: EvalProtocol, disturbed: EpisodeManifest, period: float) -> None:
+    """The controller is asked at its own rate and sees the time; the record has the protocol's steps."""
+    recorder = Recorder(signals=("proprioception",), period=period)
+    batch = rollout(recorder, short, disturbed)
+    plain = rollout(Recorder(signals=("proprioception",)), short, disturbed)
+    times = [obs.time for obs, _ in recorder.seen]
+    np.testing.assert_allclose(times, period * np.arange(len(times)), atol=1e-12)
+    assert len(times) == int(np.ceil(0.5 / period - 1e-9))
+    np.testing.assert_array_equal(batch.steps, plain.steps)
+    # the same constant command: the same episode, whatever the rate; work is sampled at other physics steps
+    np.testing.assert_array_equal(batch.ee_pos_w, plain.ee_pos_w)
+    np.testing.assert_array_equal(batch.push_step, plain.push_step)
+    np.testing.assert_allclose(np.nansum(batch.work), np.nansum(plain.work), rtol=0.3)
+    assert not np.array_equal(recorder.seen[0][0].proprioception.joint_pos, 0)
 
 
 # independence

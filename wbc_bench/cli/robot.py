@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
+from tyro.conf import FlagCreatePairsOff
 
-from wbc_bench.cli.common import drawing
+from wbc_bench.cli.common import drawing, print_table
 
 if TYPE_CHECKING:
-    from wbc_bench.robot import RobotConfig
+    from wbc_bench.results.table import Table
+    from wbc_bench.robot import Robot, RobotConfig
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,21 @@ class _Robot:
         return RobotConfig(
             variant=self.variant, mount=self.mount, tcp=self.tcp, ankle_effort=self.ankle_effort
         )
+
+
+def joint_table(robot: "Robot") -> "Table":
+    """The joints of a robot in the order of observations and commands, as the pages show them."""
+    from wbc_bench.results.table import Table
+    from wbc_bench.robot import JOINT_NAMES
+
+    facts = [robot.default_q, robot.action_scale, robot.kp, robot.kd, robot.effort, robot.velocity]
+    rows = [
+        (str(k), name, f"{low:.2f} to {high:.2f}", *(f"{column[k]:g}" for column in facts))
+        for k, (name, low, high) in enumerate(zip(JOINT_NAMES, robot.lower, robot.upper, strict=True))
+    ]
+    header = ("Index", "Joint", "Range (rad)", "Default (rad)", "Action scale (rad)", "kp (N m/rad)")
+    header += ("kd (N m s/rad)", "Effort (N m)", "Speed (rad/s)")
+    return Table("joints", f"Joints of the variant {robot.config.variant}", header, tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -54,12 +71,20 @@ class Export(_Robot):
 
 @dataclass(frozen=True)
 class Picture(_Robot):
-    """Draw the robot in its default posture."""
+    """Draw the robot in its default posture, or list its joints."""
 
     out: Path = Path("robot.png")
     """Path of the picture to write, FILE.png."""
+    joints: FlagCreatePairsOff[bool] = False
+    """Print the joints in the order of commands, with range, default posture, gains and torque limit, instead
+    of drawing."""
 
     def run(self) -> None:
+        if self.joints:
+            from wbc_bench.robot import load_robot
+
+            print_table(joint_table(load_robot(self._config())))
+            return
         drawing()
         from wbc_bench.files import ensure_writable
         from wbc_bench.robot import load_robot

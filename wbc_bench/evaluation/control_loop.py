@@ -1,9 +1,10 @@
 """A shard of episodes under one controller, a control step at a time."""
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +15,7 @@ from wbc_bench.controller import (
     ProtocolAware,
     Target,
     UsesRandomness,
+    signal_of,
 )
 from wbc_bench.episodes.manifest import EpisodeManifest
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -39,11 +41,25 @@ class StepResult(NamedTuple):
     action: NDArray[np.float64] | None = None  # (N, A) [1] of a command that is more than positions
 
 
+def at_rate_of(controller: Controller, protocol: EvalProtocol) -> tuple[EvalProtocol, int]:
+    """A protocol with the control steps of a faster controller, and how many of them one of its own takes.
+
+    Noise is then drawn at the controller's rate, like that of its sensors.
+    """
+    parts = round(protocol.control_period / max(controller.info.control_period, 1e-9))
+    physics = protocol.physics
+    if parts <= 1 or physics.decimation % parts:
+        return protocol, 1
+    physics = msgspec.structs.replace(physics, decimation=physics.decimation // parts)
+    return msgspec.structs.replace(protocol, physics=physics), parts
+
+
 class ControlLoop:
     """Observe, act, push, step, and end what has fallen.
 
     `state` and `observation` are the present ones, `odometry` is the state by which a target in the world is
-    put into the base frame: of some time ago, where the episodes' odometry is late.
+    put into the base frame: of some time ago, where the episodes' odometry is late. For a controller that is
+    faster than the protocol, each of the protocol's steps is taken in several `parts`.
     """
 
     def __init__(
@@ -53,21 +69,25 @@ class ControlLoop:
         rows: EpisodeManifest,
         scene: Scene | None = None,
     ) -> None:
-        """Raises: ControllerError when the control period is not the protocol's."""
+        """Raises: ControllerError when the control period is no multiple of the protocol's."""
+        every = protocol.control_period  # [s] of the protocol, in whose steps pushes come
+        protocol, self.parts = at_rate_of(controller, protocol)
         self.period = period = protocol.control_period  # [s]
         count = len(rows)
-        if abs(controller.info.control_period - period) > 1e-9:
+        self._every = round(controller.info.control_period / period)  # control steps per call of `act`
+        if self._every < 1 or abs(controller.info.control_period - self._every * period) > 1e-9:
             raise ControllerError(
                 f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "
-                f"protocol {protocol.name} asks for {period:g} s"
+                f"protocol {protocol.name} asks for {period:g} s, valid: that, a multiple, or a part of it "
+                f"in whole physics steps of {protocol.physics.timestep:g} s"
             )
         self._controller, self._protocol, self._rows = controller, protocol, rows
         self._randomness = GlobalRandomness(int(rows.noise_key[0]))
         self.simulation = Simulation(protocol, rows, scene)
         self.sensors = Sensors(protocol, rows, controller.info.signals)
-        self.push_step = np.full(rows.push_time.shape, -1)  # (N, P) control steps, -1 for none
+        self.push_step = np.full(rows.push_time.shape, -1)  # (N, P) the protocol's steps, -1 for none
         planned = np.isfinite(rows.push_time)
-        self.push_step[planned] = np.round(rows.push_time[planned] / period)
+        self.push_step[planned] = np.round(rows.push_time[planned] / every)
         parts = (rows.push_vel, 2), (rows.push_vel_z, 1), (rows.push_ang_vel, 3)
         self._push_vel = np.concatenate([part.reshape(count, -1, width) for part, width in parts], axis=2)
 
@@ -114,18 +134,21 @@ class ControlLoop:
             controller.reset(self._rows.episode.copy(), self.observation, target)
 
     def advance(self, target: Target) -> StepResult:
-        """One control step towards a target.
+        """One control step towards a target; a controller of a longer period is asked at every n-th of them.
 
         Raises: ControllerError when the controller fails, or its command has the wrong type or shape, or
             carries what `info.commands` does not declare.
         """
         active = self.active
-        with self.blamed("act"):
-            command = self._controller.act(self.observation, target)
+        if self.step % self._every == 0:
+            with self.blamed("act"):
+                self._command = self._controller.act(self.observation, target)
+        command = self._command
         if not isinstance(command, JointCommand):
+            fix = "is a `return` missing?" if command is None else "return JointCommand(q)"
             raise ControllerError(
                 f"controller '{self._controller.info.name}' returned {type(command).__name__} from `act`, "
-                "valid: a wbc_bench.controller.JointCommand"
+                f"valid: a wbc_bench.controller.JointCommand; {fix}"
             )
         q = self._array("commands", command.q, "iuf", (len(active), NUM_JOINTS))
         infeasible = command.infeasible
@@ -185,14 +208,26 @@ class ControlLoop:
             return drive, action_of(command.q, drive, declared, robot)
         return drive, command.action
 
-    def blamed(self, method: str) -> AbstractContextManager[None]:
-        """Where a method of the controller runs; see `isolation.blamed`."""
+    @contextmanager
+    def blamed(self, method: str) -> Iterator[None]:
+        """Where a method of the controller runs; see `isolation.blamed`. Undeclared signals are named."""
         episodes = self._rows.episode
         doing = (
             f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "
             f"of episodes {episodes.min()} to {episodes.max()}"
         )
-        return blamed(doing, self._randomness)
+        try:
+            with blamed(doing, self._randomness):
+                yield
+        except ControllerError as error:
+            cause, declared = error.__cause__, self._controller.info.signals
+            if isinstance(cause, AttributeError) and cause.obj is None:
+                signal = signal_of(cause.name)
+                if signal and signal not in declared:
+                    asked = ", ".join(f"'{name}'" for name in sorted({*declared, signal}))
+                    fix = f"`{cause.name}` is of that signal: declare signals=frozenset({{{asked}}})"
+                    raise ControllerError(f"{error}; {fix}") from cause
+            raise
 
     def _array(self, what: str, given: object, kinds: str, shape: tuple[int, ...]) -> NDArray:
         """A part of a command. Raises: ControllerError, its shape or NumPy's kind of its values is wrong."""
@@ -215,7 +250,7 @@ class ControlLoop:
         return found
 
     def _move(self, q: NDArray[np.float64], active: NDArray[np.bool_], drive: Drive | None) -> None:
-        pushed = self.push_step == self.step
+        pushed = self.push_step * self.parts == self.step
         if pushed.any():
             mask = pushed[..., None] & active[:, None, None]
             self.simulation.push(np.where(mask, self._push_vel, 0.0).sum(axis=1))

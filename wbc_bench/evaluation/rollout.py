@@ -47,25 +47,31 @@ def rollout(
     if on_step is not None:
         on_step(loop)
     before = loop.state
-    for step, (stepped, q, stuck, action) in enumerate(loop.run()):
+    for number, (stepped, q, stuck, action) in enumerate(loop.run()):
         if not stepped.any():
             break
         if on_step is not None:
             on_step(loop)
         state = loop.state
+        step, part = divmod(number, loop.parts)
         commands[stepped, step] = q[stepped]
         if action is not None:
             if actions is None:
                 actions = np.full((count, num_steps, action.shape[1]), np.nan)
             actions[stepped, step] = action[stepped]
-        load = loop.simulation.load
-        work[stepped, step] = load.work[stepped]
-        at_torque_limit[:, step], at_speed_limit[:, step] = load.at_torque_limit, load.at_speed_limit
-        slip[stepped, step] = _slip(before, state)[stepped]
+        load, slipped = loop.simulation.load, _slip(before, state)
         before = state
+        if part == 0:
+            steps[stepped] += 1
+            work[stepped, step] = load.work[stepped]
+            slip[stepped, step] = slipped[stepped]
+        else:
+            work[stepped, step] += load.work[stepped]
+            slip[stepped, step] += slipped[stepped]
+        at_torque_limit[:, step] |= load.at_torque_limit
+        at_speed_limit[:, step] |= load.at_speed_limit
         if stuck is not None:
-            infeasible[:, step] = stuck
-        steps[stepped] += 1
+            infeasible[:, step] |= stuck
         position_error[stepped, step] = np.linalg.norm(state.ee_pos_w - rows.target_pos_w, axis=1)[stepped]
         orientation_error[stepped, step] = geodesic_angle(state.ee_rot_w, target_rot_w)[stepped]
         ee_pos_w[stepped, step] = state.ee_pos_w[stepped]

@@ -89,16 +89,16 @@ def follow(
 
     `on_step` is called after every control step that was taken.
     """
-    period = protocol.control_period
     furnished = source if isinstance(source, SceneSource) else None
     loop = ControlLoop(controller, protocol, row, furnished.scene if furnished else None)
+    period = loop.period
     robot = loop.simulation.robot
     seen, scenery = seen_of(loop.state, robot), loop.simulation.scenery[0]
     if furnished:
         furnished.look(scenery)
     source.reset(seen)
     series, start = Series(period), clocks.monotonic()
-    for step in range(protocol.num_steps):
+    for step in range(protocol.num_steps * loop.parts):
         if source.live:
             clocks.sleep(max(0.0, start + step * period - clocks.monotonic()))
         if furnished:

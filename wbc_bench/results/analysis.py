@@ -3,6 +3,7 @@
 Pure functions of the episode records; no file is written here.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
@@ -85,7 +86,8 @@ class Evaluated:
 def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) -> dict[str, Evaluated]:
     """Spec -> its runs, sorted by spec, of runs under one protocol; reads their episodes, so call it once.
 
-    `labels` maps a spec to its name in tables and figures.
+    `labels` maps a spec to its name in tables and figures. One that it does not list is called what the
+    controller calls itself, unless two specs go by one name.
 
     Raises: StoreError when two runs under one name were evaluated with different protocols or manifests.
     """
@@ -108,15 +110,26 @@ def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) ->
         grouped.setdefault(run.record.controller, []).append(run)
     for group in grouped.values():
         _refuse_two_versions([run.record for run in group])
+    labels = _own_names(grouped) | dict(labels or {})
     return {
         spec: Evaluated(
             spec,
             tuple(run.record for run in group),
             pd.concat([_episodes(run) for run in group], ignore_index=True),
-            (labels or {}).get(spec, ""),
+            labels.get(spec, ""),
         )
         for spec, group in grouped.items()
     }
+
+
+def _own_names(grouped: Mapping[str, list[Any]]) -> dict[str, str]:
+    """Spec -> what its controller calls itself, where that tells it from every other."""
+    names = {spec: {run.record.controller_name for run in group} for spec, group in grouped.items()}
+    single = {spec: next(iter(found)) for spec, found in names.items() if len(found) == 1}
+    # `learned:METHOD` stands for `learned:METHOD@0` and further seeds
+    own = {spec: name for spec, name in single.items() if not name.startswith(spec)}
+    taken = Counter([*own.values(), *(spec for spec in grouped if spec not in own)])
+    return {spec: name for spec, name in own.items() if taken[name] == 1}
 
 
 TEXTS = ("stratum", "condition", "orientation", "outcome")  # columns of every file of episodes
