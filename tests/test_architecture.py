@@ -16,6 +16,7 @@ LAYERS = (
     ("cli",),
     ("publish", "viewer"),
     ("evaluation",),
+    ("policies",),
     ("registry", "episode_function"),
     ("sources",),
     ("controller",),

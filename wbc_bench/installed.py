@@ -3,11 +3,13 @@
 from importlib.metadata import EntryPoint, entry_points
 
 ENTRY_POINTS = "wbc_bench.controllers"
+# the harness itself brings no controller, but what makes one of a file
+OWN = EntryPoint("policy", "wbc_bench.policies:make", ENTRY_POINTS)
 
 
 def controllers() -> dict[str, EntryPoint]:
     """Installed controllers by name."""
-    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+    return {point.name: point for point in (OWN, *entry_points(group=ENTRY_POINTS))}
 
 
 def is_installed(spec: str) -> bool:

@@ -16,6 +16,7 @@ from wbc_bench.cli.common import THREADS, run_command
 from wbc_bench.cli.doors import DemoEval, DemoRecord, DemoTrain
 from wbc_bench.cli.evaluate import Ablation, Eval, Reach, Stress
 from wbc_bench.cli.lists import Bench, ExportController, List
+from wbc_bench.cli.policy import PolicyCheck, PolicyImport, PolicyTerms
 from wbc_bench.cli.protocol import Freeze, Reveal, Show, Verify
 from wbc_bench.cli.replay import Film, Replay
 from wbc_bench.cli.results import Compare, Latent, Report
@@ -52,6 +53,12 @@ Command = (
     | Annotated[
         Annotated[Export, subcommand("export")] | Annotated[Picture, subcommand("show")],
         subcommand("robot", description="Export or draw the robot."),
+    ]
+    | Annotated[
+        Annotated[PolicyImport, subcommand("import")]
+        | Annotated[PolicyCheck, subcommand("check")]
+        | Annotated[PolicyTerms, subcommand("terms")],
+        subcommand("policy", description="Describe a policy of another stack by a card, and check the card."),
     ]
     | Annotated[ExportController, subcommand("export")]
     | Annotated[Bench, subcommand("bench")]

@@ -1,0 +1,65 @@
+"""ONNX files of one layer each, and the same in NumPy, for the tests of policies by their cards."""
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+FLOAT = TensorProto.FLOAT
+
+
+def weights(seed: int, rows: int, columns: int, size: float = 0.1) -> np.ndarray:
+    """Random weights, small enough that the robot stands for a while."""
+    draw = np.random.default_rng(seed).normal(size=(rows, columns))
+    return (size * draw / np.sqrt(rows)).astype(np.float32)
+
+
+def write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict, **metadata: str) -> Path:
+    """Write a graph; inputs and outputs are name -> shape."""
+    values = [
+        [helper.make_tensor_value_info(name, FLOAT, shape) for name, shape in part.items()]
+        for part in (inputs, outputs)
+    ]
+    tensors = [numpy_helper.from_array(array, name) for name, array in constants.items()]
+    graph = helper.make_graph(nodes, "small", *values, tensors)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, metadata)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def layer(path: Path, w: np.ndarray, batch: str | int = "batch", **metadata: str) -> Path:
+    """`actions` = tanh(obs w)."""
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["product"]),
+        helper.make_node("Tanh", ["product"], ["actions"]),
+    ]
+    shapes = {"obs": [batch, w.shape[0]]}, {"actions": [batch, w.shape[1]]}
+    return write(path, nodes, *shapes, {"w": w}, **metadata)
+
+
+def recurrent(path: Path, w: np.ndarray, u: np.ndarray, batch: str | int = "batch") -> Path:
+    """`h_out` = tanh(obs w + h_in u), also written as `latent`; the state has its batch on axis 1."""
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["product"]),
+        helper.make_node("Squeeze", ["h_in", "first"], ["h"]),
+        helper.make_node("MatMul", ["h", "u"], ["carried"]),
+        helper.make_node("Add", ["product", "carried"], ["sum"]),
+        helper.make_node("Tanh", ["sum"], ["latent"]),
+        helper.make_node("Unsqueeze", ["latent", "first"], ["h_out"]),
+    ]
+    size = u.shape[0]
+    shapes = (
+        {"obs": [batch, w.shape[0]], "h_in": [1, batch, size]},
+        {"latent": [batch, size], "h_out": [1, batch, size]},
+    )
+    return write(path, nodes, *shapes, {"w": w, "u": u, "first": np.array([0], dtype=np.int64)})
+
+
+def strip(path: Path, out: Path) -> Path:
+    """A graph without what its exporter wrote beside it."""
+    model = onnx.load(path)
+    del model.metadata_props[:]
+    out.write_bytes(model.SerializeToString())
+    return out
