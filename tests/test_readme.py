@@ -4,13 +4,16 @@ import re
 import tomllib
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from wbc_bench.cli.main import main
+from wbc_bench.cli.policy import term_table
 from wbc_bench.cli.robot import joint_table
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.evaluation.rollout import rollout
+from wbc_bench.policies.card import PolicyCard, check_card
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import RobotConfig, load_robot
 
@@ -90,3 +93,13 @@ def test_joint_tables_are_those_of_the_facts(page: str, variant: str) -> None:
 def test_joints_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     main(["robot", "show", "--joints", "--variant", "paper"])
     assert "| 3 | ankle_L_Joint | -1.15 to 1.57 | 0 | 0.6 | 45 | 0.8 | 40 | 15 |" in capsys.readouterr().out
+
+
+def test_the_vocabulary_on_its_page_is_that_of_the_code() -> None:
+    page = (ROOT / "docs" / "policies.md").read_text()
+    assert "\n".join(term_table().markdown().splitlines()[2:]) in page
+
+
+def test_the_card_on_its_page_is_one() -> None:
+    text = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "policies.md").read_text(), re.DOTALL)
+    check_card(msgspec.toml.decode(text[0], type=PolicyCard), "docs/policies.md")

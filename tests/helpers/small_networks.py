@@ -63,3 +63,53 @@ def strip(path: Path, out: Path) -> Path:
     del model.metadata_props[:]
     out.write_bytes(model.SerializeToString())
     return out
+
+
+def front(path: Path, frames: int, width: int) -> Path:
+    """What another stack may have in front of a network.
+
+    `command` (9) of `goal` (7), a position and a quaternion wxyz. Of `past`, frames of the oldest first:
+    `newest` (width), its columns `body` (34) and `hand` (9), and `window` (frames, width), one step older.
+    """
+    nodes, constants = [], {"two": np.float32([2.0]), "one": np.float32([1.0])}
+
+    def node(operator: str, *inputs: str, **attributes) -> str:
+        name = f"v{len(nodes)}"
+        nodes.append(helper.make_node(operator, list(inputs), [name], **attributes))
+        return name
+
+    def integers(*values: int) -> str:
+        name = f"i{len(constants)}"
+        constants[name] = np.array(values, dtype=np.int64)
+        return name
+
+    def part(source: str, start: int, stop: int, axis: int = 1) -> str:
+        return node("Slice", source, integers(start), integers(stop), integers(axis))
+
+    w, x, y, z = (part("goal", k, k + 1) for k in range(3, 7))
+
+    def twice(a: str, b: str, operator: str, c: str, d: str) -> str:
+        return node("Mul", "two", node(operator, node("Mul", a, b), node("Mul", c, d)))
+
+    first = [node("Sub", "one", twice(y, y, "Add", z, z)), twice(x, y, "Add", w, z), twice(x, z, "Sub", w, y)]
+    second = [
+        twice(x, y, "Sub", w, z),
+        node("Sub", "one", twice(x, x, "Add", z, z)),
+        twice(y, z, "Add", w, x),
+    ]
+    shaped = node("Reshape", "past", integers(-1, frames, width))
+    nodes.append(helper.make_node("Concat", [part("goal", 0, 3), *first, *second], ["command"], axis=1))
+    older = [part(shaped, 0, 1), part(shaped, 0, frames - 1)]
+    nodes.append(helper.make_node("Concat", older, ["window"], axis=1))
+    last = part(shaped, frames - 1, frames)
+    nodes.append(helper.make_node("Squeeze", [last, integers(1)], ["newest"]))
+    for name, start, stop in (("body", 0, 34), ("hand", 48, 57)):
+        nodes.append(helper.make_node("Identity", [part("newest", start, stop)], [name]))
+    shapes = (
+        {"goal": ["batch", 7], "past": ["batch", frames * width]},
+        {
+            **{"command": ["batch", 9], "newest": ["batch", width], "window": ["batch", frames, width]},
+            **{"body": ["batch", 34], "hand": ["batch", 9]},
+        },
+    )
+    return write(path, nodes, *shapes, constants)

@@ -101,9 +101,7 @@ def draft(network: Path, description: Path | None) -> Draft:
         return found
     content = _yaml(description)
     kinds = "an Isaac Lab IO descriptor or a Unitree deploy.yaml"
-    with reading(
-        "description", description, "an Isaac Lab IO descriptor or a Unitree deploy.yaml", ControllerError
-    ):
+    with reading("description", description, kinds, ControllerError):
         if "articulations" in content:
             _from_isaac(found, content)
         elif "joint_ids_map" in content or "step_dt" in content:

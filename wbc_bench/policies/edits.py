@@ -40,7 +40,11 @@ def edits(card: PolicyCard, robot: Robot) -> Iterator[Edit]:
         other = "xyzw" if card.quaternion == "wxyz" else "wxyz"
         yield Edit("quaternion order", f"quaternion = '{other}'", _replace(card, quaternion=other))
     yield from _frames(card)
+    yield from _actions(card, robot)
     yield from _signs(card)
+
+
+def _actions(card: PolicyCard, robot: Robot) -> Iterator[Edit]:
     names = card.action.joints or card.joints
     if card.action.type == "position":
         for offset in ("default", 0.0):

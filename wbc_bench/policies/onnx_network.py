@@ -1,5 +1,6 @@
 """ONNX files of others, run by onnxruntime on one thread; nothing in a file is executed but its graph."""
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -166,7 +167,7 @@ def open_session(path: Path):
         graph that can be run.
     """
     try:
-        import onnxruntime
+        import onnxruntime  # noqa: F401
     except ImportError as error:
         raise ControllerError(missing_extra("a policy by its card", "policy", error)) from error
     data = read_bytes(path, "policy", ControllerError)
@@ -175,8 +176,16 @@ def open_session(path: Path):
             f"policy '{path}' is a pickled file, which could execute code and is not read, valid: an ONNX "
             "file, exported with torch.onnx.export where it was trained"
         )
+    with reading("policy", path, "an ONNX file that can be run", ControllerError):
+        return _session(data)
+
+
+@lru_cache(maxsize=4)
+def _session(data: bytes):
+    """A session of the bytes of a file; a session has no state, so that controllers may share it."""
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    with reading("policy", path, "an ONNX file that can be run", ControllerError):
-        return onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
