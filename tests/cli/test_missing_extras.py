@@ -23,6 +23,7 @@ CASES = [
     ("placo", "placo", "ik", ("eval", "--controller", "ik:standing", "--protocol", "smoke_v1")),
     ("osqp", "osqp", "ik", ("eval", "--controller", "ik:osqp", "--protocol", "smoke_v1")),
     ("torch", "torch", "learned", ("eval", "--controller", "learned:none@0", "--protocol", "smoke_v1")),
+    ("onnxruntime", "onnxruntime", "policy", ("policy", "import", "pyproject.toml")),
     ("pinocchio", "pin", "bench", ("bench", "ik")),
     ("viser", "viser", "view", ("live", "--controller", "hold")),
     ("torch", "torch", "diffusion", ("live", "--controller", "hold", "--source", "diffusion")),

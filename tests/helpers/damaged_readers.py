@@ -18,6 +18,7 @@ import torch
 
 from damage import damage
 from policies import write
+from small_networks import layer, weights
 from synthetic import episodes, reach_episodes
 from trainers import TINY, trainer
 from training_targets import PROTOCOL, TARGETS
@@ -36,6 +37,9 @@ from wbc_bench.episodes.protocol import find_protocol, read_protocol
 from wbc_bench.episodes.sealed import Commitment, read_commitment
 from wbc_bench.errors import BenchError
 from wbc_bench.files import PROTOCOLS
+from wbc_bench.policies.controller import from_card
+from wbc_bench.policies.descriptions import draft
+from wbc_bench.policies.normalizer import read_normalizers
 from wbc_bench.results.analysis import collect_all
 from wbc_bench.results.doors import door_table, read_doors, write_doors
 from wbc_bench.results.margins import analyse
@@ -329,6 +333,47 @@ def seal_exported(folder: Path) -> None:
     path.write_bytes(model + seal(model))
 
 
+POLICY_CARD = """
+name = "walker"
+joints = ["J1", "J2", "J3"]
+[[observation]]
+name = "policy"
+history = 2
+terms = [
+    { term = "joint_pos_rel", scale = [1.0, 0.5, 0.1] },
+    { term = "projected_gravity", clip = [-1.0, 1.0] },
+]
+[[network]]
+file = "walk.onnx"
+inputs = { obs = "policy" }
+outputs = { actions = "action" }
+[action]
+scale = 0.25
+kp = [40.0, 30.0, 20.0]
+"""
+DEPLOY = """
+step_dt: 0.02
+stiffness: [40.0, 30.0, 20.0]
+actions: { JointPositionAction: { joint_names: [J1, J2, J3], scale: [0.25, 0.25, 0.25] } }
+observations: { joint_pos_rel: { scale: [1.0, 0.5, 0.1], history_length: 2 } }
+"""
+
+
+def write_policy_card(folder: Path) -> None:
+    layer(folder / "walk.onnx", weights(0, 12, 3), observation_names="joint_pos,actions", action_scale="0.25")
+    (folder / "card.toml").write_text(POLICY_CARD)
+    (folder / "deploy.yaml").write_text(DEPLOY)
+
+
+def read_policy_card(folder: Path) -> None:
+    draft(folder / "walk.onnx", folder / "deploy.yaml").text()
+    draft(folder / "walk.onnx", None).text()
+    controller = from_card(load_robot(), folder / "card.toml")
+    for network in controller.networks:
+        read_normalizers(network.path, network.widths)
+        network({group.name: np.zeros((2, group.size)) for group in controller.groups})
+
+
 def write_door_policy(folder: Path) -> None:
     facts = {"format": 1, "seed": 0, "demonstrations": 1, "demonstrations_seed": 0, "samples": 1, "steps": 1}
     facts |= {"demonstrations_sha256": "0" * 64, "batch": 1, "hidden": 16, "git_commit": None, "torch": "0"}
@@ -390,6 +435,7 @@ READERS = {
     "report": Reader(write_report_parts, read_report_parts),
     "checkpoint": Reader(write_checkpoint, read_checkpoint, seal_checkpoint),
     "onnx": Reader(write_exported, read_exported, seal_exported),
+    "policy card": Reader(write_policy_card, read_policy_card),
     "door policy": Reader(write_door_policy, read_door_policy),
     "training": Reader(write_training, read_training),
     "targets": Reader(write_targets, read_targets),

@@ -128,8 +128,8 @@ def test_what_the_normaliser_knows_is_printed(
 
 def test_a_missing_term_is_named_at_once(foreign: Path) -> None:
     path = foreign / "short.toml"
-    path.write_text(FOREIGN.replace('{ term = "last_action" }, ', ""))
-    with pytest.raises(BenchError, match="reads 58 numbers as 'observation', the card gives 44"):
+    path.write_text(FOREIGN.replace('{ term = "joint_effort" }, ', ""))
+    with pytest.raises(BenchError, match="reads 570 numbers as 'past', the card gives 430: past 430"):
         check_policy(path)
 
 

@@ -177,7 +177,10 @@ def open_session(path: Path):
             "file, exported with torch.onnx.export where it was trained"
         )
     with reading("policy", path, "an ONNX file that can be run", ControllerError):
-        return _session(data)
+        session = _session(data)
+        # names may be no text, which is found when they are asked for
+        _ = session.get_inputs(), session.get_outputs(), session.get_modelmeta().custom_metadata_map
+        return session
 
 
 @lru_cache(maxsize=4)
