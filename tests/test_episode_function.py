@@ -74,7 +74,7 @@ def test_a_function_of_one_episode_is_the_batched_controller(tmp_path: Path) -> 
         np.testing.assert_allclose(a.episodes[name], b.episodes[name], rtol=1e-9)
     assert b.records[0].controller_name == "one" and "| one | 6/6 |" in str(b)
     other = wbc_bench.evaluate(f"{one}:One?gain=0.3", protocol, out=tmp_path / "out")
-    assert (other.episodes["position_error"] != b.episodes["position_error"]).all()
+    assert np.all(other.episodes["position_error"] != b.episodes["position_error"])
     assert (tmp_path / "out" / "runs" / "tiny").is_dir()
     soft = wbc_bench.evaluate(f"{one}:soft", protocol)
     assert soft.records[0].commands == ["kp"]

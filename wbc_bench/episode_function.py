@@ -81,9 +81,10 @@ class _PerEpisode:
 
     def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
         """Start the episodes with these numbers, (N,)."""
-        make, robot = self.function, self._robot
+        make: Callable[..., Any] = self.function
+        robot = self._robot
         if inspect.isclass(make):
-            self._calls = [make(robot, **self._options) for _ in episodes]
+            self._calls: list[Callable[..., Any]] = [make(robot, **self._options) for _ in episodes]  # pyright: ignore[reportCallIssue]
         else:
             self._calls = [lambda *seen: make(robot, *seen, **self._options)] * len(episodes)
 

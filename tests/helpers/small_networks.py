@@ -22,7 +22,7 @@ def write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict,
         for part in (inputs, outputs)
     ]
     tensors = [numpy_helper.from_array(array, name) for name, array in constants.items()]
-    graph = helper.make_graph(nodes, "small", *values, tensors)
+    graph = helper.make_graph(nodes, "small", values[0], values[1], tensors)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     helper.set_model_props(model, metadata)
     path.write_bytes(model.SerializeToString())
@@ -71,7 +71,9 @@ def front(path: Path, frames: int, width: int) -> Path:
     `command` (9) of `goal` (7), a position and a quaternion wxyz. Of `past`, frames of the oldest first:
     `newest` (width), its columns `body` (34) and `hand` (9), and `window` (frames, width), one step older.
     """
-    nodes, constants = [], {"two": np.float32([2.0]), "one": np.float32([1.0])}
+    nodes: list = []
+    constants: dict[str, np.ndarray] = {}
+    constants["one"], constants["two"] = np.array([[1.0], [2.0]], dtype=np.float32)
 
     def node(operator: str, *inputs: str, **attributes) -> str:
         name = f"v{len(nodes)}"

@@ -12,7 +12,7 @@ import wbc_bench
 from small_networks import layer, recurrent, weights
 from tiny_protocol import write_tiny
 from wbc_bench.cli.main import main
-from wbc_bench.controller import Controller, ControllerInfo, JointCommand, Observation, Target
+from wbc_bench.controller import Controller, ControllerInfo, JointCommand, Observation, Signal, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import BenchError, ControllerError
@@ -30,8 +30,8 @@ class Both:
     """Drives with one controller and asks a second one the same."""
 
     def __init__(self, first: Controller, second: Controller) -> None:
-        signals = first.info.signals | second.info.signals
-        self.info = first.info._replace(signals=signals, commands=first.info.commands | second.info.commands)
+        one, other = first.info, second.info
+        self.info = one._replace(signals=one.signals | other.signals, commands=one.commands | other.commands)
         self._pair, self.steps, self.worst = (first, second), 0, 0.0
 
     def prepare(self, protocol: EvalProtocol) -> None:
@@ -84,7 +84,7 @@ class Reference:
     """A policy as its author would write it for this bench, in NumPy alone."""
 
     def __init__(self, compute: Callable, period: float = 0.02, parts: tuple = ("action",)) -> None:
-        signals = frozenset({"proprioception", "ee_pose"})
+        signals: frozenset[Signal] = frozenset({"proprioception", "ee_pose"})
         self.info = ControllerInfo("reference", signals, period, "tests", commands=frozenset(parts))
         self._compute = compute
 

@@ -5,7 +5,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.controller import CommandPart, Controller, ControllerInfo, JointCommand, Observation, Target
+from wbc_bench.controller import (
+    CommandPart,
+    Controller,
+    ControllerInfo,
+    JointCommand,
+    Observation,
+    Signal,
+    Target,
+)
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
 from wbc_bench.policies.card import PolicyCard, check_card, read_card
@@ -63,7 +71,9 @@ class CardController:
         self._others: Controller | None = None
         if action.others != "hold":
             self._others = load_controller(action.others, robot)
-        signals = {signal for group in self.groups for column in group.columns for signal in column.signals}
+        signals: set[Signal] = {
+            signal for group in self.groups for column in group.columns for signal in column.signals
+        }
         commands: set[CommandPart] = set(self._gains)  # pyright: ignore[reportAssignmentType]
         if torque:
             commands.add("torque")

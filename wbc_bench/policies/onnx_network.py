@@ -109,7 +109,7 @@ class OnnxNetwork:
         size = self._size(state.input)
         if not state.initial:
             return np.zeros((count, size))
-        frame = values[state.initial].astype(np.float32)
+        frame = values[state.initial]
         return np.tile(frame, (1, size // frame.shape[1]))
 
     def _shape(self, name: str, axis: int) -> tuple[int, ...]:

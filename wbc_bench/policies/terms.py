@@ -132,7 +132,9 @@ def _gait(seen: Seen, card: TermCard) -> Array:
     return _ones(seen) * np.column_stack([np.sin(angle), np.cos(angle)]).ravel()
 
 
-_P, _E, _B = ("proprioception",), ("ee_pose",), ("base_pose",)
+_P: tuple[Signal, ...] = ("proprioception",)
+_E: tuple[Signal, ...] = ("ee_pose",)
+_B: tuple[Signal, ...] = ("base_pose",)
 TERMS: dict[str, Term] = {
     "base_ang_vel": Term(
         "vector",
