@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from foreign_policy import own_policy  # noqa: F401  (a fixture)
 from live_page import served  # noqa: F401  (a fixture)
 from tiny_protocol import manifest
 from wbc_bench.episodes.manifest import EpisodeManifest

@@ -16,7 +16,7 @@ LAYERS = (
     ("cli",),
     ("publish", "viewer"),
     ("evaluation",),
-    ("policies",),
+    ("policies", "remote"),
     ("registry", "episode_function"),
     ("sources",),
     ("controller",),

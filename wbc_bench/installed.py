@@ -3,13 +3,16 @@
 from importlib.metadata import EntryPoint, entry_points
 
 ENTRY_POINTS = "wbc_bench.controllers"
-# the harness itself brings no controller, but what makes one of a file
-OWN = EntryPoint("policy", "wbc_bench.policies:make", ENTRY_POINTS)
+# the harness itself brings no controller, but what makes one of a file or of an address
+OWN = (
+    EntryPoint("policy", "wbc_bench.policies:make", ENTRY_POINTS),
+    EntryPoint("remote", "wbc_bench.remote:make", ENTRY_POINTS),
+)
 
 
 def controllers() -> dict[str, EntryPoint]:
     """Installed controllers by name."""
-    return {point.name: point for point in (OWN, *entry_points(group=ENTRY_POINTS))}
+    return {point.name: point for point in (*OWN, *entry_points(group=ENTRY_POINTS))}
 
 
 def is_installed(spec: str) -> bool:

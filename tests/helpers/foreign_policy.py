@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from small_networks import strip
 from wbc_bench.cli.main import main
 
 OWN = """
@@ -44,6 +43,8 @@ scale = [0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.6, 0.3, 0.3, 0.3, 0.2, 0.2, 0.2]
 def own_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a policy of this project, as a file of somebody else: without its card."""
     pytest.importorskip("torch")
+    from small_networks import strip
+
     folder = tmp_path_factory.mktemp("own")
     main(["export", "--controller", "learned:transformer_gru@0", "-o", str(folder / "sealed.onnx")])
     strip(folder / "sealed.onnx", folder / "bare.onnx")
