@@ -76,8 +76,8 @@ def test_equal_bits_to_the_same_code_in_process(tmp_path: Path) -> None:
         np.testing.assert_array_equal(there.episodes[name], here.episodes[name], err_msg=name)
 
 
-def answering(act: Callable[[dict], bytes | None], **info: object) -> Callable[[zmq.Socket], None]:
-    """A policy with an `act` of its own; None is no answer."""
+def answering(act: Callable[[dict], bytes], **info: object) -> Callable[[zmq.Socket], None]:
+    """A policy with an `act` of its own."""
     hello = {"name": "odd", "signals": [], "control_period": 0.02} | info
 
     def loop(socket: zmq.Socket) -> None:
@@ -85,8 +85,6 @@ def answering(act: Callable[[dict], bytes | None], **info: object) -> Callable[[
             asked = msgspec.msgpack.decode(socket.recv())
             answer = {"hello": hello, "reset": {}}.get(asked["type"])
             data = act(asked) if answer is None else msgspec.msgpack.encode(answer)
-            if data is None:
-                socket.recv()  # which never comes: REP must answer first
             socket.send(data)
 
     return loop

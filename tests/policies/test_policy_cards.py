@@ -55,7 +55,7 @@ class Both:
 
 
 def together(
-    first: Controller, second: Controller, protocol: EvalProtocol, steps: int, count: int = 4, least: int = 60
+    first: Controller, second: Controller, protocol: EvalProtocol, steps: int, count: int = 4, least: int = 20
 ) -> float:
     """The largest difference of their commands over an episode with noise, pushes and random dynamics."""
     rows, _ = read_manifest(find_protocol("smoke_v1")[0], manifest_path(find_protocol("smoke_v1")[1]))

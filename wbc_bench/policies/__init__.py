@@ -20,7 +20,12 @@ class Policies:
 
     def variants(self) -> list[tuple[str, str]]:
         """Return the form of a variant, with its description."""
-        return [("CARD.toml", "A policy of another stack, described by a card: `wbc-bench policy import`.")]
+        return [
+            (
+                "CARD.toml",
+                "A policy of another stack, described by a card: `wbc-bench policy import FILE.onnx`.",
+            )
+        ]
 
 
 make = Policies()
