@@ -1,9 +1,12 @@
 """Damage to files, drawn from a random generator: bits, lengths, values, columns, and no file at all."""
 
+import hashlib
 import io
 import json
 import os
 import re
+import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,18 @@ LITERALS = [  # of numbers in text
     *(b"0", b"-1", b"1e308", b"-1e-308", b"1e400", b"nan", b"inf", b"-inf", b"true", b'""', b"[]", b"{}"),
     *(b"9223372036854775808", b"1" + b"0" * 30, b"9" * 5000, b"0.0", b"1.5", b"null", b"1_000_000_000"),
 ]
+
+
+def sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def reseal(record: Path, field: str, data: Path) -> None:
+    """Put the SHA-256 of a file into the JSON beside it, damaged or not."""
+    text = re.sub(
+        rf'("{field}":\s*")[0-9a-f]*"', rf'\g<1>{sha256(data)}"', record.read_text(errors="replace")
+    )
+    record.write_text(text)
 
 
 def damage(rng: Rng, path: Path) -> str:
@@ -301,6 +316,41 @@ def tensors(rng: Rng, data: bytes) -> bytes:
     return save(found, metadata=metadata)
 
 
+# --- zips -----------------------------------------------------------------------------------------------
+
+
+def entry(rng: Rng, data: bytes) -> bytes:
+    """An entry damaged, gone, twice, of another name, or huge; the sums of the zip fit what it holds."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = [(info, archive.read(info)) for info in archive.infolist()]
+    except (zipfile.BadZipFile, ValueError, OSError, NotImplementedError, RuntimeError, EOFError):
+        return data  # damaged already
+    if not entries:
+        return data
+    place, how = int(rng.integers(len(entries))), rng.integers(12)
+    info, content = entries[place]
+    changes = [flip, truncate, number, json_value, json_value, cut_out, insert, nest]
+    if how < len(changes):
+        entries[place] = (info, changes[how](rng, content))
+    elif how == 8:
+        del entries[place]
+    elif how == 9:
+        entries.insert(int(rng.integers(len(entries) + 1)), entries[place])
+    elif how == 10:
+        name = info.filename
+        others = ["../x", "/x", f"{name}/0", name[:-1] + "1.0", "日本", "zarr.json", entries[0][0].filename]
+        entries[place] = (zipfile.ZipInfo(others[rng.integers(len(others))]), content)
+    else:
+        entries[place] = (info, b"\0" * (16 << 20))
+    sink, packing = io.BytesIO(), int(rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED]))
+    with warnings.catch_warnings(), zipfile.ZipFile(sink, "w") as archive:
+        warnings.simplefilter("ignore")  # two entries of one name
+        for info, content in entries:
+            archive.writestr(info.filename, content, packing)
+    return sink.getvalue()
+
+
 _TEXT: list[tuple[str, Mutation]] = [("number", number), ("string", string), ("lines", lines), ("nest", nest)]
 _TABLES = [(change.__name__, _table(change)) for change in _COLUMNS]
 _OF_SUFFIX: dict[str, list[tuple[str, Mutation]]] = {
@@ -308,6 +358,8 @@ _OF_SUFFIX: dict[str, list[tuple[str, Mutation]]] = {
     ".json": [*_TEXT, ("value", json_value), ("value", json_value), ("value", json_value)],
     ".parquet": [*_TABLES, *_TABLES, ("inflate", _table(inflate))],
     ".safetensors": [("tensors", tensors)] * 4,
+    ".zip": [("entry", entry)] * 6,
+    ".py": _TEXT,
 }
 
 # --- the file itself ------------------------------------------------------------------------------------

@@ -92,7 +92,7 @@ def test_bytes_do_not_depend_on_order_interruption_or_software(tmp_path):
     assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.parametrize("damage", ["truncated", "flipped bit", "empty", "short"])
+@pytest.mark.parametrize("damage", ["truncated", "flipped bit", "empty", "short", "a pipe", "a value"])
 def test_a_damaged_shard_is_computed_again(tmp_path, damage):
     store = ResultStore(tmp_path)
     writer = RunWriter(store, key())
@@ -101,6 +101,12 @@ def test_a_damaged_shard_is_computed_again(tmp_path, damage):
     data = bytearray(path.read_bytes())
     if damage == "short":
         writer.write(1, rows(range(3, 5)), COST)
+    elif damage == "a pipe":
+        path.unlink()
+        os.mkfifo(path)
+    elif damage == "a value":  # as a whole file of the right key
+        table = pq.read_table(path)
+        pq.write_table(table.set_column(0, table.column_names[0], pa.array([9] * len(table))), path)
     else:
         data[8] ^= 1 if damage == "flipped bit" else 0
         path.write_bytes({"truncated": data[:-20], "flipped bit": data, "empty": b""}[damage])

@@ -86,7 +86,8 @@ class RunWriter:
     def _write(self, shard: int, episodes: pa.Table, cost: ShardCost) -> None:
         _make(self._shards)
         facts = {"key": msgspec.json.encode(self.key), "cost": msgspec.json.encode(cost)}
-        write_atomic(self._shard_path(shard), _parquet(episodes, facts, checksum=True))
+        facts["rows_sha256"] = _rows_sha256(episodes).encode()
+        write_atomic(self._shard_path(shard), _parquet(episodes, facts))
 
     def finish(self, facts: Mapping[str, Any]) -> Run:
         """Merge the shards, write the record, then remove the shards; `facts` completes the record."""
@@ -162,6 +163,7 @@ class RunWriter:
     def _whole_shards(self, overwrite: bool) -> dict[int, ShardCost]:
         """Whole shards of an earlier session; a damaged one is moved aside and computed again.
 
+        Damaged is what cannot be read, and what are not the rows that were written, whatever they are now.
         With `overwrite` those of another key are not refused but computed again.
         """
         whole = {}
@@ -170,11 +172,13 @@ class RunWriter:
             if not path.exists():
                 continue
             try:
-                table = read_parquet(path, "shard", StoreError, page_checksum_verification=True)
+                table = read_parquet(path, "shard", StoreError)
                 facts = table.schema.metadata or {}
                 with reading("shard", path, "a shard of this store", StoreError):
                     key = msgspec.json.decode(facts[b"key"], type=RunKey)
                     cost = msgspec.json.decode(facts[b"cost"], type=ShardCost)
+                    if facts[b"rows_sha256"].decode() != _rows_sha256(table):
+                        raise StoreError(f"shard '{path}' does not hold the rows that were written")
             except StoreError:
                 path.replace(path.with_suffix(".damaged"))
                 continue
@@ -201,7 +205,11 @@ class RunWriter:
             self._shards.rmdir()
 
 
-def _parquet(table: pa.Table, facts: Mapping[str, str | bytes], checksum: bool = False) -> bytes:
+def _rows_sha256(table: pa.Table) -> str:
+    return hashlib.sha256(_parquet(table, {})).hexdigest()
+
+
+def _parquet(table: pa.Table, facts: Mapping[str, str | bytes]) -> bytes:
     sink = pa.BufferOutputStream()
     table = table.replace_schema_metadata(dict(facts))
     pq.write_table(
@@ -209,7 +217,6 @@ def _parquet(table: pa.Table, facts: Mapping[str, str | bytes], checksum: bool =
         sink,
         compression="zstd",
         use_dictionary=[name for name in LABELS if name in table.column_names],  # pyright: ignore[reportArgumentType]
-        write_page_checksum=checksum,
     )
     return sink.getvalue().to_pybytes()
 
