@@ -22,8 +22,6 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 ROOT = Path(__file__).parents[1]
 REPLICATES, EPISODES, SHARDS = 3, 200, 4  # shards of a replicate
@@ -63,7 +61,7 @@ class Trials:
         self._protocol = write_tiny(scratch, REPLICATES, EPISODES)
         self._code = scratch / "code"
         self._code.mkdir()
-        self._wanted: dict[Version, dict[int, pa.Table]] = {}
+        self._wanted: dict[Version, dict[int, bytes]] = {}
         self.version: Version = (0, 0, 0)
         self._write()
 
@@ -148,23 +146,23 @@ class Trials:
         """Every finished replicate is one that was never killed; how many there are."""
         records = _records(store)
         for replicate, path in records.items():
-            table = pq.read_table(path.with_name("episodes.parquet")).replace_schema_metadata()
-            assert any(table.equals(self.wanted(version)[replicate]) for version in versions), (
+            data = path.with_name("episodes.parquet").read_bytes()
+            assert any(data == self.wanted(version)[replicate] for version in versions), (
                 f"{path.parent}: replicate {replicate} is none of {len(versions)} versions"
             )
         return len(records)
 
-    def wanted(self, version: Version) -> dict[int, pa.Table]:
-        """Replicates of an evaluation of a version that was never killed, in one process."""
+    def wanted(self, version: Version) -> dict[int, bytes]:
+        """Episodes of the replicates of an evaluation of a version that was never killed, in one process."""
         if version not in self._wanted:
             now, self.version = self.version, version
             self._write()
             store = self._scratch / f"unkilled_{len(self._wanted)}"
-            command = [sys.executable, "-m", "wbc_bench", "eval", "--out", str(store)]
+            command = [sys.executable, "-m", "wbc_bench", "eval", "--out", str(store), "--workers", "1"]
             command += ["--controller", f"{self._code / 'killed.py'}:Mine", "--protocol", str(self._protocol)]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            tables = {k: pq.read_table(p.with_name("episodes.parquet")) for k, p in _records(store).items()}
-            self._wanted[version] = {k: table.replace_schema_metadata() for k, table in tables.items()}
+            paths = {k: path.with_name("episodes.parquet") for k, path in _records(store).items()}
+            self._wanted[version] = {k: path.read_bytes() for k, path in paths.items()}
             self.version = now
             self._write()
         return self._wanted[version]

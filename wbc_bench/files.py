@@ -58,7 +58,7 @@ def write_atomic(path: Path, data: bytes) -> None:
 
     Raises: StoreError when the disk is full or the folder cannot be written; nothing is left behind.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    part = temporary(path)
     try:
         with part.open("wb") as file:
             file.write(data)
@@ -72,6 +72,54 @@ def write_atomic(path: Path, data: bytes) -> None:
         raise StoreError(
             f"cannot write '{path}': {error.strerror}; whatever was finished before is kept"
         ) from error
+
+
+def temporary(path: Path) -> Path:
+    """What a file is called beside its place until it is whole; a name of any length leaves room for that."""
+    return path.with_name(f".{path.name[: LONGEST_NAME // 2]}.{os.getpid()}.tmp")
+
+
+@contextlib.contextmanager
+def writing(place: Path) -> Iterator[None]:
+    """Turn what the system raises where something is written into one line. Raises: StoreError."""
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(f"cannot write to '{place}': {error.strerror or error}") from error
+
+
+@contextlib.contextmanager
+def made_whole(out: Path) -> Iterator[tuple[Path, list[Path]]]:
+    """Several files, of which none is replaced before all are made.
+
+    Yields:
+        An empty folder to make them in; they are moved below `out` at the end. And a list, which then holds
+        where they stand, in order.
+
+    Raises:
+        StoreError: They cannot be written; what was there before is kept.
+    """
+    moved: list[Path] = []
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        with scratch_folder(out) as made:
+            yield made, moved
+            for path in sorted(made.rglob("*")):
+                if path.is_file():
+                    place = out / path.relative_to(made)
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    moved.append(path.replace(place))
+
+
+def ensure_file_writable(path: Path) -> None:
+    """Check that a file can be written, before minutes are spent on its content; see `ensure_writable`.
+
+    Raises: StoreError, its folder cannot be written, its name is too long, or it is there and no file.
+    """
+    ensure_writable(path.parent)
+    with writing(path):
+        if path.exists() and not path.is_file():  # a device would be replaced
+            raise StoreError(f"'{path}' is a {'folder' if path.is_dir() else 'device'}, valid: a file")
 
 
 def ensure_writable(folder: Path) -> None:

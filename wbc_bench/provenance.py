@@ -120,6 +120,8 @@ def software(controller: object) -> Software:
     for path in sources(type(controller).__module__):
         _add(digest, path.name, path.read_bytes())
     for path in map(Path, getattr(getattr(controller, "info", None), "files", ())):
+        if path.exists() and not path.is_file():  # a pipe would wait for its writer
+            raise ControllerError(f"file '{path}', declared in `info.files`, is not a file")
         try:
             _add(digest, path.name, path.read_bytes())
         except OSError as error:
@@ -173,7 +175,7 @@ def sources(module: str) -> list[Path]:
         if name.partition(".")[0] != top and (packaged or name.startswith("wbc_bench")):
             continue  # another package; the harness has a digest of its own
         for path in (_files_of(name, home) if name != "__main__" else {first}) - seen:
-            seen |= {path, *path.parent.glob("*.toml")} if packaged else {path}
+            seen |= {path, *filter(Path.is_file, path.parent.glob("*.toml"))} if packaged else {path}
             queue += _imports(path, home)
     return sorted(seen)
 

@@ -1,8 +1,7 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -10,7 +9,7 @@ import pandas as pd
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import ReachTargets, load_protocol, protocol_names, read_protocol
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.files import PROTOCOLS, scratch_folder
+from wbc_bench.files import PROTOCOLS, made_whole
 from wbc_bench.results import report
 from wbc_bench.results.analysis import Evaluated, collect_all
 from wbc_bench.results.doors import DoorRun, door_table, read_doors
@@ -72,25 +71,19 @@ def publish(
     specs = known | {track.record.controller for track in tracks}
     specs |= {climb.spec for stress in ladders for climb in stress.climbs}
     colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
-    with _writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        with scratch_folder(out) as made:
-            for protocol, methods in evaluated.items():
-                _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
-            write_sealed_tables(evaluated, made / "tables")
-            _write_tracks(tracks, made, labels, colours)
-            _write_doors(doors, made, labels)
-            for stress in ladders:
-                found = analyse(stress)
-                write_stress_tables(stress, found, made / "tables")
-                write_stress_figure(stress, found, made / "figures", colours)
-            protocol_of = {study.name: study.protocol for study in known_studies}
-            report.write(evaluated, made, out, protocol_of, ladders, os.path.relpath(store.root, out))
-            return [
-                _move(path, out / path.relative_to(made))
-                for path in sorted(made.rglob("*"))
-                if path.is_file()
-            ]
+    with made_whole(out) as (made, paths):
+        for protocol, methods in evaluated.items():
+            _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
+        write_sealed_tables(evaluated, made / "tables")
+        _write_tracks(tracks, made, labels, colours)
+        _write_doors(doors, made, labels)
+        for stress in ladders:
+            found = analyse(stress)
+            write_stress_tables(stress, found, made / "tables")
+            write_stress_figure(stress, found, made / "figures", colours)
+        protocol_of = {study.name: study.protocol for study in known_studies}
+        report.write(evaluated, made, out, protocol_of, ladders, os.path.relpath(store.root, out))
+    return paths
 
 
 def publish_tracks(root: Path, out: Path) -> list[Path]:
@@ -98,8 +91,9 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
 
     Raises: StoreError when a track cannot be read or the folder cannot be written.
     """
-    with _writing(out):
-        return _write_tracks(read_tracks(root), out, labels_of(released_rows()))
+    with made_whole(out) as (made, paths):
+        _write_tracks(read_tracks(root), made, labels_of(released_rows()))
+    return paths
 
 
 def publish_doors(root: Path, out: Path) -> list[Path]:
@@ -107,8 +101,9 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
 
     Raises: StoreError when a run cannot be read or the folder cannot be written.
     """
-    with _writing(out):
-        return _write_doors(read_doors(root), out, labels_of(released_rows()))
+    with made_whole(out) as (made, paths):
+        _write_doors(read_doors(root), made, labels_of(released_rows()))
+    return paths
 
 
 def _place(item: tuple[str, Mapping[str, Evaluated]]) -> tuple[bool, str]:
@@ -116,14 +111,6 @@ def _place(item: tuple[str, Mapping[str, Evaluated]]) -> tuple[bool, str]:
     name = item[0]
     leads = name in protocol_names() and load_protocol(name).robot != RobotConfig()
     return not leads, name
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise StoreError(f"cannot write to '{out}': {error.strerror}") from error
 
 
 def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
@@ -156,17 +143,12 @@ def _write_protocol(
 
 def _write_tracks(
     tracks: list[Track], out: Path, labels: Mapping[str, str], colours: Mapping[str, str] | None = None
-) -> list[Path]:
-    if not tracks:
-        return []
-    paths = tracking_table(tracks, labels).write(out / "tables")
-    return paths + write_tracking(tracks, out / "figures", labels, colours)
+) -> None:
+    if tracks:
+        tracking_table(tracks, labels).write(out / "tables")
+        write_tracking(tracks, out / "figures", labels, colours)
 
 
-def _write_doors(runs: list[DoorRun], out: Path, labels: Mapping[str, str]) -> list[Path]:
-    return door_table(runs, labels).write(out / "tables") if runs else []
-
-
-def _move(source: Path, destination: Path) -> Path:
-    destination.parent.mkdir(parents=True, exist_ok=True)
-    return source.replace(destination)
+def _write_doors(runs: list[DoorRun], out: Path, labels: Mapping[str, str]) -> None:
+    if runs:
+        door_table(runs, labels).write(out / "tables")

@@ -113,7 +113,6 @@ def read_scripts(folder: Path) -> None:
 
 CODE = {
     "coded.py": """
-import json
 from pathlib import Path
 from coded_helper import SHARE
 from wbc_bench.controller import ControllerInfo, JointCommand
@@ -124,7 +123,7 @@ class Mine:
     info = ControllerInfo("mine", frozenset({"proprioception"}), 0.02, "a test", (SETTINGS,))
 
     def __init__(self, robot):
-        self.q = robot.default_q + json.loads(SETTINGS.read_text())["offset"]
+        self.q = robot.default_q
 
     def reset(self, episodes, obs, target):
         self.calls = 0

@@ -76,6 +76,8 @@ def test_a_changed_record_is_not_verified(run: Run) -> None:
     changed = dataclasses.replace(again, stored=shifted)
     assert list(changed.differences) == ["position_error"]
     assert "the same outcome, but 1 of 27" in changed.verdict and "position_error by" in changed.verdict
+    newer = dataclasses.replace(again, stored=again.stored | {"jerk": 0.5})  # of a version that measures more
+    assert newer.differences == {"jerk": (0.5, None)} and "jerk None (recorded 0.5)" in newer.verdict
 
 
 def test_a_controller_that_rounds_with_its_company_is_run_in_its_shard(

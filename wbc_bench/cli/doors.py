@@ -28,13 +28,13 @@ class DemoRecord:
 
     def run(self) -> None:
         from wbc_bench.evaluation.doors import record
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
 
         at_least_one("--episodes", self.episodes)
         at_least_one("--workers", self.workers)
         not_negative("--seed", self.seed)
-        ensure_writable(self.out.parent)
+        ensure_file_writable(self.out)
         with Progress("episodes") as progress:
             kept = record(self.out, self.controller, self.seed, self.episodes, self.workers, progress.update)
         print(f"{self.out}: {kept} of {self.episodes} episodes closed their door and are kept")
@@ -57,7 +57,7 @@ class DemoTrain:
         import time
 
         from wbc_bench.errors import SourceError, missing_extra
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
 
         try:
@@ -68,7 +68,7 @@ class DemoTrain:
 
         at_least_one("--updates", self.updates)
         not_negative("--seed", self.seed)
-        ensure_writable(self.out.parent)
+        ensure_file_writable(self.out)
         start = time.monotonic()
         with Progress("updates") as progress:
             policy, card = train(

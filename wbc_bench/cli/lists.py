@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
-from wbc_bench.cli.common import NO_RECORDS, RESULTS, UsageError, print_table
+from wbc_bench.cli.common import NO_RECORDS, RESULTS, print_table
 from wbc_bench.errors import UnknownNameError
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class ExportController:
         from wbc_bench.controller import Exportable
         from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.errors import ControllerError
-        from wbc_bench.files import ensure_writable, folder_name, scratch_folder
+        from wbc_bench.files import ensure_file_writable, folder_name, scratch_folder, writing
         from wbc_bench.isolation import blamed
         from wbc_bench.registry import load_controller
         from wbc_bench.robot import load_robot
@@ -240,10 +240,11 @@ class ExportController:
         if not isinstance(controller, Exportable) or self.format not in formats:
             raise UnknownNameError("format", self.format, formats, f"--format, for '{self.controller}'")
         path = self.out or Path(f"{folder_name(self.controller)}.{self.format}")
-        if path.is_dir():
-            raise UsageError(f"--out {path}: a folder, valid: a file")
-        ensure_writable(path.parent)
-        with scratch_folder(path.parent) as folder:  # one that fails half-way leaves what was there
+        ensure_file_writable(path)
+        with (
+            writing(path),
+            scratch_folder(path.parent) as folder,
+        ):  # one that fails half-way leaves what was there
             with blamed(failed):
                 controller.export(folder / path.name, self.format)
             made = [file.name for file in folder.iterdir()]
@@ -266,7 +267,7 @@ class Bench:
     def run(self) -> None:
         from importlib.metadata import entry_points
 
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import ensure_writable, made_whole
         from wbc_bench.isolation import blamed
         from wbc_bench.results.table import Table
 
@@ -285,4 +286,5 @@ class Bench:
             table = Table(name, f"Benchmark {name}", tuple(map(str, frame.columns)), tuple(cells), data=frame)
             print_table(table)
             if self.out:
-                table.write(self.out)
+                with made_whole(self.out) as (made, _):
+                    table.write(made)

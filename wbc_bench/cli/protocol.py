@@ -121,7 +121,7 @@ class Show:
 
         from wbc_bench.episodes.manifest import manifest_path, read_manifest
         from wbc_bench.episodes.protocol import find_protocol
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import made_whole
         from wbc_bench.publish import target_frame
         from wbc_bench.results.figures.targets import write_targets
 
@@ -131,6 +131,6 @@ class Show:
         manifest, sha256 = read_manifest(protocol, manifest_path(path))
         print(f"# manifest sha256 {sha256}")
         print(target_frame(manifest).groupby("stratum").describe().T.to_string())
-        ensure_writable(self.out)
-        for picture in write_targets(target_frame(manifest), protocol.name, self.out):
-            print(picture)
+        with made_whole(self.out) as (made, paths):
+            write_targets(target_frame(manifest), protocol.name, made)
+        print(*paths, sep="\n")

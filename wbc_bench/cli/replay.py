@@ -36,12 +36,6 @@ class _Again:
             return ResultStore(self.results).find(self.name)
         return open_records(self.results).find(self.name)
 
-    def _check_folder(self, path: Path) -> None:
-        """Before minutes are spent on what cannot be written."""
-        from wbc_bench.files import ensure_writable
-
-        ensure_writable(path.parent)
-
 
 @dataclass(frozen=True)
 class Replay(_Again):
@@ -52,10 +46,11 @@ class Replay(_Again):
 
     def run(self) -> None:
         drawing()
+        from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
         from wbc_bench.viewer.replay import write_html
 
-        self._check_folder(self.out)
+        ensure_file_writable(self.out)
         run = self._find()
         with Progress("steps") as progress:
             again = write_html(run, self.episode, self.out, self.protocol, progress.update, self.controller)
@@ -77,7 +72,7 @@ class Film(_Again):
 
     def run(self) -> None:
         drawing()
-        from wbc_bench.files import write_atomic
+        from wbc_bench.files import ensure_file_writable, write_atomic
         from wbc_bench.progress import Progress
         from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
         from wbc_bench.viewer.picture import write_png
@@ -89,7 +84,7 @@ class Film(_Again):
             if path and path.suffix != suffix:
                 raise UsageError(f"'{path}': valid: a file that ends in {suffix}")
             if path:
-                self._check_folder(path)
+                ensure_file_writable(path)
         run = self._find()
         with Progress("steps") as progress:
             again = rerun(run, self.episode, self.protocol, progress.update, self.controller)

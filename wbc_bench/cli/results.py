@@ -28,7 +28,7 @@ class Compare:
 
     def run(self) -> None:
         from wbc_bench.episodes.protocol import load_protocol
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import made_whole
         from wbc_bench.results.analysis import collect
         from wbc_bench.results.tables.pairs import compare_table
         from wbc_bench.results.tables.write import write_compare_table
@@ -43,8 +43,8 @@ class Compare:
         evaluated = collect(runs)
         print_table(compare_table(name, evaluated, self.a, self.b))
         if self.out:
-            ensure_writable(self.out)
-            write_compare_table(name, evaluated, self.a, self.b, self.out)
+            with made_whole(self.out) as (made, _):
+                write_compare_table(name, evaluated, self.a, self.b, made)
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Latent:
         from wbc_bench.episodes.manifest import manifest_path, read_manifest
         from wbc_bench.episodes.protocol import find_protocol
         from wbc_bench.evaluation.latents import sample_latents
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import ensure_writable, made_whole
         from wbc_bench.registry import load_controller, spec_of_replicate
         from wbc_bench.results.figures.latents import summary, write_latents
         from wbc_bench.results.latents import LEAST_EPISODES
@@ -102,10 +102,11 @@ class Latent:
         spec = spec_of_replicate(self.controller, 0)
         controller = load_controller(spec, load_robot(protocol.robot))
         rows = manifest.of_replicate(0, self.episodes)
-        samples = sample_latents(controller, protocol, rows)
         ensure_writable(self.out)
+        samples = sample_latents(controller, protocol, rows)
         labels = labels_of(released_rows())
         label = labels.get(spec) or labels.get(self.controller)
         name = controller.info.name
-        found, paths = write_latents(name, protocol.name, samples, self.seed, self.out, label)
+        with made_whole(self.out) as (made, paths):
+            found, _ = write_latents(name, protocol.name, samples, self.seed, made, label)
         print(*summary(samples, found), *paths, sep="\n")

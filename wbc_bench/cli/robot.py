@@ -86,11 +86,11 @@ class Picture(_Robot):
             print_table(joint_table(load_robot(self._config())))
             return
         drawing()
-        from wbc_bench.files import ensure_writable
+        from wbc_bench.files import ensure_file_writable
         from wbc_bench.robot import load_robot
         from wbc_bench.viewer.picture import render
 
         robot = load_robot(self._config())
-        ensure_writable(self.out.parent)
+        ensure_file_writable(self.out)
         render(robot, self.out)
         print(self.out)

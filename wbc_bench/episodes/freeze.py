@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import tempfile
 from dataclasses import fields
 from pathlib import Path
 
@@ -13,8 +12,8 @@ from wbc_bench.episodes.manifest import write_manifest
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import Progress
-from wbc_bench.errors import ManifestError
-from wbc_bench.files import PROTOCOLS
+from wbc_bench.errors import ManifestError, StoreError
+from wbc_bench.files import PROTOCOLS, ensure_file_writable, scratch_folder
 
 
 def freeze(
@@ -27,13 +26,19 @@ def freeze(
 
     Raises:
         ProtocolError: a stratum or a height that cannot be filled.
-        ManifestError: the manifest is a released one, or the folder cannot be written.
+        ManifestError: the manifest is a released one, or it cannot be written, which is tried first.
     """
     _refuse_released(path)
+    try:
+        if not path.parent.is_dir():  # the protocol stands there: a folder that is missing is a mistake
+            raise StoreError(f"folder '{path.parent}' does not exist")
+        ensure_file_writable(path)
+    except StoreError as error:
+        raise ManifestError(f"manifest '{path}' cannot be written: {error}") from error
     manifest = build_manifest(protocol, progress, workers)
     try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}_") as folder:
-            fresh = Path(folder) / path.name
+        with scratch_folder(path.parent) as folder:
+            fresh = folder / path.name
             write_manifest(manifest, protocol, fresh)
             sha256 = hashlib.sha256(fresh.read_bytes()).hexdigest()
             note = fresh.with_suffix(".sha256")

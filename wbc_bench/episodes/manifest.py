@@ -58,7 +58,9 @@ def write_manifest(manifest: EpisodeManifest, protocol: EvalProtocol, path: Path
     if robot != FIRST_ROBOT:  # manifests from before robots had digests keep their bytes
         metadata["robot_digest"] = robot
     table = table.replace_schema_metadata(metadata)
-    pq.write_table(table, path, compression="zstd", use_dictionary=False)
+    sink = pa.BufferOutputStream()  # given a path, arrow takes a tilde for a home folder, a colon for a URI
+    pq.write_table(table, sink, compression="zstd", use_dictionary=False)
+    path.write_bytes(sink.getvalue())
 
 
 def read_manifest(

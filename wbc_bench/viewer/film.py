@@ -1,6 +1,5 @@
 """An episode as a film or as a strip of pictures, drawn without a window: `wbc-bench film`."""
 
-import os
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.errors import BenchError, StoreError, missing_extra
+from wbc_bench.files import temporary
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 from wbc_bench.viewer.picture import Canvas, add_axes, add_bones, add_connector
@@ -38,7 +38,7 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
         from imageio_ffmpeg import count_frames_and_secs, write_frames
     except ImportError as error:
         raise BenchError(missing_extra("a film", "film", error)) from error
-    part = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    part = temporary(path)
     rate = 1 / (EVERY * again.protocol.control_period)  # [1/s]
     shown = range(0, len(again.moments), EVERY)
     try:

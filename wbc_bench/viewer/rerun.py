@@ -48,8 +48,8 @@ class Rerun:
 
     @property
     def differences(self) -> dict[str, tuple[Any, Any]]:
-        """Column -> (stored, again) of whatever is not equal to the last bit."""
-        pairs = {name: (value, self.again[name]) for name, value in self.stored.items()}
+        """Column -> (stored, again) of what is not equal to the last bit; None for what is not measured."""
+        pairs = {name: (value, self.again.get(name)) for name, value in self.stored.items()}
         return {name: pair for name, pair in pairs.items() if not _same(*pair)}
 
     @property

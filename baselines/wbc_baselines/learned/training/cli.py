@@ -221,6 +221,7 @@ class Dagger:
         from wbc_baselines.learned.training.dagger import METHOD, dagger
         from wbc_baselines.learned.training.target_set import read_target_set
         from wbc_bench.episodes.protocol import find_protocol
+        from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
 
         for name in ("episodes", "rounds", "updates", "workers"):
@@ -233,6 +234,7 @@ class Dagger:
             )
         if self.path.suffix != ".safetensors":
             raise TrainingError(f"--path '{self.path}': valid: a name that ends in .safetensors")
+        ensure_file_writable(self.path)
         protocol, _ = find_protocol(self.protocol)
         begun = time.monotonic()
         with Progress("episodes") as progress:
@@ -269,12 +271,14 @@ class Targets:
     def run(self) -> None:
         from wbc_baselines.learned.training.target_set import TARGET_SETS, draw_target_set, write_target_set
         from wbc_bench.episodes.protocol import find_protocol
+        from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
 
         if self.count < 3:
             raise TrainingError(f"--count {self.count}: valid: 3 or more, one per stratum")
         protocol, _ = find_protocol(self.protocol)
         path = self.path or TARGET_SETS / f"{protocol.name}.parquet"
+        ensure_file_writable(path)
         with Progress("targets") as progress:
             target_set = draw_target_set(protocol, self.count, self.workers, progress.update)
         write_target_set(target_set, protocol, path)

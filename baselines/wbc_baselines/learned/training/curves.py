@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from wbc_baselines.learned.policy.methods import METHODS, Reward
 from wbc_baselines.learned.training.config import TrainingError
 from wbc_baselines.learned.training.run_folder import run_folders
+from wbc_bench.files import made_whole
 from wbc_bench.results.figures.style import DASHES, controller_colours, save, styled
 
 Rows = list[dict]
@@ -135,9 +136,13 @@ def write_curves(out: Path, figures: Path, name: str = "learning_curves") -> lis
 
     Returns:
         The PNG and the SVG file; nothing if there is no run.
+
+    Raises:
+        StoreError: They cannot be written.
     """
     runs = [(folder.path.name, folder.read_metrics()) for folder in run_folders(out, "metrics.jsonl")]
     if not runs:
         return []
-    with styled():
-        return save(curves_figure(runs), name, figures)
+    with styled(), made_whole(figures) as (made, paths):
+        save(curves_figure(runs), name, made)
+    return paths

@@ -16,7 +16,8 @@ import msgspec
 
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
-from wbc_bench.files import write_atomic
+from wbc_bench.errors import StoreError
+from wbc_bench.files import ensure_writable, write_atomic, writing
 from wbc_bench.readers import read_bytes, read_json, read_text, reading
 
 if TYPE_CHECKING:
@@ -144,14 +145,26 @@ class RunFolder:
         _append(self.metrics, row)
 
     def take(self) -> bool:
-        """Claim the run for this process; return False if another running process has claimed it."""
-        self.path.mkdir(parents=True, exist_ok=True)
+        """Claim the run for this process; return False if another running process has claimed it.
+
+        Raises:
+            StoreError: The folder cannot be written.
+        """
+        ensure_writable(self.path)
         try:
-            with self.claim.open("x") as file:
-                file.write(_me())
-            return True
+            file = self.claim.open("x")
         except FileExistsError:
-            pass
+            return self._take_over()
+        try:
+            with writing(self.claim), file:
+                file.write(_me())
+        except StoreError:
+            self.claim.unlink()
+            raise
+        return True
+
+    def _take_over(self) -> bool:
+        """Claim the run if the process that had claimed it has ended."""
         try:
             idle = time.time() - self.claim.stat().st_mtime
         except FileNotFoundError:
@@ -342,7 +355,7 @@ def _writer(folder: RunFolder, iteration: int):
 
 
 def _append(path: Path, row: dict) -> None:
-    with path.open("a+b") as file:
+    with writing(path), path.open("a+b") as file:
         if file.tell() and not _ends_with_newline(file):
             file.write(b"\n")  # the line before was cut short
         file.write(json.dumps(row).encode() + b"\n")

@@ -22,6 +22,7 @@ from wbc_bench.episodes.manifest import check_robot
 from wbc_bench.episodes.protocol import EvalProtocol, WorkspaceTargets
 from wbc_bench.episodes.workspace_targets import draw_workspace_target
 from wbc_bench.errors import ManifestError, ProtocolError
+from wbc_bench.files import write_atomic
 from wbc_bench.outcomes import STRATA
 from wbc_bench.parallel import in_parallel
 from wbc_bench.readers import read_parquet
@@ -97,7 +98,10 @@ def write_target_set(target_set: TargetSet, protocol: EvalProtocol, path: Path) 
     Args:
         target_set: Targets to write.
         protocol: Protocol they were generated for.
-        path: Parquet file.
+        path: Parquet file, in a folder that is there.
+
+    Raises:
+        StoreError: It cannot be written.
     """
     columns = [pa.array(target_set.stratum)]
     for values in target_set[1:]:
@@ -107,10 +111,9 @@ def write_target_set(target_set: TargetSet, protocol: EvalProtocol, path: Path) 
     table = table.replace_schema_metadata(
         {"protocol": protocol.name, "digest": digest(protocol), "robot_digest": robot}
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(f".{path.name}.part")
-    pq.write_table(table, fresh, compression="zstd", use_dictionary=False)
-    fresh.replace(path)
+    buffer = pa.BufferOutputStream()
+    pq.write_table(table, buffer, compression="zstd", use_dictionary=False)
+    write_atomic(path, buffer.getvalue().to_pybytes())
 
 
 def read_target_set(
