@@ -16,6 +16,7 @@ from wbc_bench.errors import ControllerError
 from wbc_bench.evaluation.evaluate import evaluate
 from wbc_bench.evaluation.latents import sample_latents
 from wbc_bench.isolation import GlobalRandomness
+from wbc_bench.provenance import software
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import load_robot
 
@@ -143,6 +144,65 @@ def test_what_an_import_draws_does_not_shift_the_factory(tmp_path: Path, draw: s
     ]
     lines = [line for run in found for line in run.stdout.splitlines()]
     assert len(lines) == 4 and len(set(lines)) == 1, [run.stderr for run in found]
+
+
+SHARED = "import random\nAT_IMPORT = random.random()\n"
+SHARES = """
+random.random()
+import {helper}
+
+class Drawn(Mine):
+    def __init__(self, robot):
+        import {helper}_inside
+        self.drawn = {helper}.AT_IMPORT, {helper}_inside.AT_IMPORT, random.random()
+"""
+
+
+def test_what_a_shared_helper_draws_does_not_depend_on_who_imported_it(tmp_path: Path) -> None:
+    """Two controllers of a folder import it, one of them after it has drawn, at the top and in a function."""
+    (tmp_path / "drawn_helper.py").write_text(SHARED)
+    (tmp_path / "drawn_helper_inside.py").write_text(SHARED)
+    text = HEAD + SHARES.format(helper="drawn_helper")
+    (tmp_path / "shares_a.py").write_text(text)
+    (tmp_path / "shares_b.py").write_text(text.replace("random.random()\nimport", "import"))
+    code = (
+        "from wbc_bench.registry import load_controller\nfrom wbc_bench.robot import load_robot\n"
+        "drawn = {{name: load_controller(f'{folder}/shares_{{name}}.py:Drawn', load_robot()).drawn\n"
+        "         for name in {order!r}}}\nprint([drawn[name] for name in 'ab'])"
+    )
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", code.format(folder=tmp_path, order=order)], capture_output=True, text=True
+        )
+        for order in ("ab", "ba")
+    ]
+    assert found[0].stdout == found[1].stdout != "", found[0].stderr
+
+
+def test_helpers_of_one_name_are_not_mixed_up(tmp_path: Path) -> None:
+    for folder, share in (("one", 0.1), ("two", 0.9)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "namesake.py").write_text(f"SHARE = {share}\n")
+        path = tmp_path / folder / f"of_{folder}.py"
+        path.write_text(f"import namesake\n{HEAD}    share = namesake.SHARE\n")
+    assert load_controller(f"{tmp_path}/one/of_one.py:Mine", load_robot()).share == 0.1  # pyright: ignore
+    with pytest.raises(ControllerError, match="of the same name: give one of them another"):
+        load_controller(f"{tmp_path}/two/of_two.py:Mine", load_robot())
+    (tmp_path / "two" / "namesake.py").rename(tmp_path / "two" / "another.py")
+    path = tmp_path / "two" / "of_two.py"
+    path.write_text(path.read_text().replace("namesake", "another"))
+    assert load_controller(f"{path}:Mine", load_robot()).share == 0.9  # pyright: ignore
+
+
+def test_a_digest_draws_from_streams_of_its_own(tmp_path: Path) -> None:
+    body = "def digest(self):\n    return f'{random.random()} {np.random.rand()}'"
+    drawing = load_controller(controller(tmp_path, "digest_draws", body), load_robot())
+    random.seed(1)
+    first, state = software(drawing).controller, random.getstate()
+    random.seed(2)
+    assert software(drawing).controller == first
+    random.seed(1)
+    assert random.getstate() == state
 
 
 def test_streams_go_on_where_they_were_left() -> None:

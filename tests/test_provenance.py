@@ -1,5 +1,6 @@
 """Digests: what computes an episode counts, and nothing else does."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -129,6 +130,9 @@ class Declares:
 def test_a_declared_file_that_is_missing_is_named(tmp_path):
     with pytest.raises(ControllerError, match=r"nowhere\.bin.*info\.files"):
         provenance.software(Declares(tmp_path / "nowhere.bin"))
+    os.mkfifo(tmp_path / "pipe")  # which would wait for its writer
+    with pytest.raises(ControllerError, match=r"pipe'.* is not a file"):
+        provenance.software(Declares(tmp_path / "pipe"))
 
 
 def test_a_controller_inside_a_controller_counts(tmp_path):

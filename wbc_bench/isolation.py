@@ -9,6 +9,10 @@ import random
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import PathFinder, SourceFileLoader
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -74,6 +78,47 @@ def blamed(doing: str, randomness: GlobalRandomness | None = None) -> Iterator[N
         raise
     except BaseException as error:
         raise ControllerError(f"{doing}: {fault_of(error)}") from error
+
+
+class _Alone(SourceFileLoader):
+    """Imports a module with global random streams of its own, which begin anew."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        with GlobalRandomness(0).own():
+            super().exec_module(module)
+
+
+class _UsersModules(MetaPathFinder):
+    """Finds the modules of folders of users, to be imported alone.
+
+    What one of them draws at its import then depends neither on who imported it first nor on what that one
+    drew before, and shifts nothing for whoever imports it, at the top or in the midst of a function.
+    """
+
+    def __init__(self) -> None:
+        self.folders: set[str] = set()
+
+    def find_spec(self, fullname: str, path: Any = None, target: ModuleType | None = None) -> Any:
+        places = [place for place in sys.path if place in self.folders] if path is None else path
+        spec = PathFinder.find_spec(fullname, places, target)
+        if spec is None or type(spec.loader) is not SourceFileLoader:
+            return None
+        if not any(Path(spec.loader.path).is_relative_to(folder) for folder in self.folders):
+            return None
+        spec.loader = _Alone(spec.loader.name, spec.loader.path)
+        return spec
+
+
+_USERS_MODULES = _UsersModules()
+
+
+def import_alone_from(folder: str) -> None:
+    """Have modules below a folder found first, and imported with random streams of their own."""
+    _USERS_MODULES.folders.add(folder)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    if _USERS_MODULES not in sys.meta_path:
+        sys.meta_path.insert(0, _USERS_MODULES)
 
 
 def _states() -> dict[str, Any]:

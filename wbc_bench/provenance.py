@@ -18,7 +18,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from wbc_bench.errors import BenchError, ControllerError, fault_of
+from wbc_bench.errors import ControllerError
+from wbc_bench.isolation import blamed
 
 PACKAGE = Path(__file__).parent
 ROOT = "wbc_bench.evaluation.shard"  # what computes an episode, with all that it imports
@@ -133,13 +134,8 @@ def software(controller: object) -> Software:
             _add(digest, "part", software(part).controller.encode())
     own = getattr(controller, "digest", None)
     if callable(own):
-        try:
+        with blamed(f"controller '{type(controller).__name__}' failed in `digest`"):
             _add(digest, "digest()", str(own()).encode())
-        except (BenchError, KeyboardInterrupt):
-            raise
-        except BaseException as error:
-            name = type(controller).__name__
-            raise ControllerError(f"controller '{name}' failed in `digest`: {fault_of(error)}") from error
     return Software(_harness(), digest.hexdigest())
 
 

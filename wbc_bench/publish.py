@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.episodes.protocol import ReachTargets, load_protocol, protocol_names, read_protocol
+from wbc_bench.episodes.protocol import EvalProtocol, ReachTargets, load_protocol, protocol_names
 from wbc_bench.errors import StoreError, UnknownNameError
 from wbc_bench.files import PROTOCOLS, made_whole
 from wbc_bench.results import report
@@ -51,7 +51,9 @@ def publish(
     known_studies = list({study.name: study for study in (*released_studies(), *studies)}.values())
     rows = [row for study in known_studies for row in study.rows]
     labels = labels_of(rows)
-    evaluated = dict(sorted(collect_all(store.runs(), labels).items(), key=_place))
+    collected = collect_all(store.runs(), labels)
+    released = {name: load_protocol(name) for name in protocol_names() if name in collected}
+    evaluated = {name: collected[name] for name in sorted(collected, key=lambda name: _place(name, released))}
     for study in known_studies:
         if study.name != study.protocol and study.name in evaluated:
             raise StudyError(
@@ -73,7 +75,8 @@ def publish(
     colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
     with made_whole(out) as (made, paths):
         for protocol, methods in evaluated.items():
-            _write_protocol(protocol, methods, made, beside, studies_of(protocol, known_studies), colours)
+            own = studies_of(protocol, known_studies)
+            _write_protocol(protocol, released.get(protocol), methods, made, beside, own, colours)
         write_sealed_tables(evaluated, made / "tables")
         _write_tracks(tracks, made, labels, colours)
         _write_doors(doors, made, labels)
@@ -106,10 +109,9 @@ def publish_doors(root: Path, out: Path) -> list[Path]:
     return paths
 
 
-def _place(item: tuple[str, Mapping[str, Evaluated]]) -> tuple[bool, str]:
+def _place(name: str, released: Mapping[str, EvalProtocol]) -> tuple[bool, str]:
     """Order of the protocols in a report: the released ones of the paper's robot lead."""
-    name = item[0]
-    leads = name in protocol_names() and load_protocol(name).robot != RobotConfig()
+    leads = name in released and released[name].robot != RobotConfig()
     return not leads, name
 
 
@@ -121,13 +123,13 @@ def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:
 
 def _write_protocol(
     name: str,
+    released: EvalProtocol | None,
     methods: Mapping[str, Evaluated],
     out: Path,
     beside: Sequence[str],
     studies: Sequence[Study],
     colours: Mapping[str, str],
 ) -> None:
-    released = read_protocol(PROTOCOLS / f"{name}.toml") if name in protocol_names() else None
     for study in studies:
         if released and isinstance(released.targets, ReachTargets):
             write_reach_tables(study, methods, out / "tables")

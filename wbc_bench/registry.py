@@ -21,7 +21,7 @@ from wbc_bench.controller import (
 )
 from wbc_bench.errors import ControllerError, UnknownNameError
 from wbc_bench.installed import controllers
-from wbc_bench.isolation import blamed
+from wbc_bench.isolation import blamed, import_alone_from
 from wbc_bench.robot import Robot
 
 ControllerFactory = Callable[[Robot], Controller]
@@ -213,8 +213,7 @@ def _load_attribute(module: str, attribute: str):
                 f"controller file '{module}': '{path.stem}' is no module name, valid: letters, digits and _"
             )
         folder, module = str(path.parent), path.stem
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
+    import_alone_from(folder)
     _forget_edited()
     try:
         found = importlib.import_module(module)
@@ -230,6 +229,7 @@ def _load_attribute(module: str, attribute: str):
             "give the file another"
         )
     _LOADED[module] = _state_of(module)
+    _refuse_namesakes(module)
     if not hasattr(found, attribute):
         raise ControllerError(f"controller '{module}:{attribute}': module has no '{attribute}'")
     return getattr(found, attribute)
@@ -241,6 +241,29 @@ _LOADED: dict[str, dict[Path, int]] = {}  # a user's module -> its files when it
 def _state_of(module: str) -> dict[Path, int]:
     """Files of a user's module and of what it imports from its folder, with their times of change [ns]."""
     return {path: path.stat().st_mtime_ns for path in provenance.sources(module)}
+
+
+def _refuse_namesakes(module: str) -> None:
+    """Raises: ControllerError, two folders have modules of one name, and one would run with the other's."""
+    own = {_name_of(path): path for path in _LOADED[module]}
+    for files in list(_LOADED.values()):
+        for path in files:
+            there = own.get(_name_of(path), path)
+            if there != path and path.is_file():
+                _forget([module])
+                raise ControllerError(
+                    f"controller module '{module}' needs '{there}', and another controller '{path}', "
+                    "of the same name: give one of them another, or evaluate them in processes of their own"
+                )
+
+
+def _name_of(path: Path) -> str:
+    """Name of a file's module in its folder of the path, e.g. `package.part`; the file where it is none."""
+    folders = [folder for folder in map(Path, sys.path) if path.is_relative_to(folder)]
+    if path.suffix != ".py" or not folders:
+        return str(path)
+    nearest = max(folders, key=lambda folder: len(folder.parts))
+    return ".".join(path.relative_to(nearest).with_suffix("").parts).removesuffix(".__init__")
 
 
 def _forget_edited() -> None:

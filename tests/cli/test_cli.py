@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,27 @@ def tiny(tmp_path) -> Path:
 def evaluate(protocol: Path, out: Path, *more: object, controller: str = "hold") -> None:
     words = ["eval", "--controller", controller, "--protocol", protocol, "--out", out, "--workers", 1, *more]
     main([str(word) for word in words])
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("no_such_module:made", "ModuleNotFoundError"),
+        ("math:no_such_attribute", "AttributeError"),
+        ("math:pi", "TypeError"),
+        ("builtins:dict", "TypeError"),  # what it returns is no table
+    ],
+)
+def test_benchmarks_and_inputs_of_others_fail_in_one_line(capsys, monkeypatch, value, message):
+    def points(group):
+        return [metadata.EntryPoint("broken", value, group)]
+
+    monkeypatch.setattr(metadata, "entry_points", points)
+    line = fails(capsys, "bench", "broken")
+    assert "benchmark 'broken' failed" in line and message in line
+    main(["list", "--inputs"])
+    shown = capsys.readouterr().out
+    assert "Inputs of broken" in shown and (value == "builtins:dict" or "cannot be listed" in shown)
 
 
 def test_unknown_controller_names_the_nearest(capsys, tiny, tmp_path):

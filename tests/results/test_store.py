@@ -19,7 +19,15 @@ import pytest
 
 from synthetic import FakeRun, episodes, record
 from wbc_bench.errors import StoreError, UnknownNameError
-from wbc_bench.files import STALE, ensure_writable, folder_name, scratch_folder, write_atomic
+from wbc_bench.files import (
+    STALE,
+    ensure_file_writable,
+    ensure_writable,
+    folder_name,
+    made_whole,
+    scratch_folder,
+    write_atomic,
+)
 from wbc_bench.outcomes import SuccessRule
 from wbc_bench.results import store as store_module
 from wbc_bench.results.analysis import collect
@@ -329,6 +337,35 @@ def test_ensure_writable_refuses_what_cannot_be_written(tmp_path):
             ensure_writable(root)
     ensure_writable(tmp_path / "new" / "folder")
     assert list((tmp_path / "new" / "folder").iterdir()) == []
+
+
+def test_several_files_are_replaced_together_or_not_at_all(tmp_path):
+    (tmp_path / "a.txt").write_text("before")
+    with pytest.raises(StoreError, match="cannot write to"), made_whole(tmp_path) as (made, _):
+        (made / "a.txt").write_text("after")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "before"
+    with made_whole(tmp_path / "~new:") as (made, paths):
+        (made / "sub").mkdir()
+        (made / "sub" / "b.txt").write_text("b")
+        (made / "a.txt").write_text("a")
+    assert paths == [tmp_path / "~new:" / "a.txt", tmp_path / "~new:" / "sub" / "b.txt"]
+    assert [path.name for path in (tmp_path / "~new:").iterdir()] in (["a.txt", "sub"], ["sub", "a.txt"])
+
+
+def test_a_file_is_tried_before_it_is_made(tmp_path):
+    """A folder, a pipe or a device in its place would be found out, or replaced, after the work."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    cases = (("folder", "is a folder, valid: a file"), ("pipe", "is a device"), ("n" * 256, "too long"))
+    for name, message in cases:
+        with pytest.raises(StoreError, match=message):
+            ensure_file_writable(tmp_path / name)
+    long = tmp_path / "new" / ("ü" * 120 + ".html")  # 245 bytes
+    ensure_file_writable(long)
+    write_atomic(long, b"whole")
+    assert [path.read_bytes() for path in long.parent.iterdir()] == [b"whole"]
 
 
 def test_record_round_trips(tmp_path):

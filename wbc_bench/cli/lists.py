@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 SHOWN = ("ablation_v2", "ablation_v1")  # protocols whose successes stand beside the controllers
 BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
-INPUTS = (
-    "wbc_bench.inputs"  # entry points: name -> a callable that returns rows (vector, columns, term, unit)
-)
+INPUTS = "wbc_bench.inputs"  # entry points: name -> a callable: rows (vector, columns, size, term, unit)
 
 
 @dataclass(frozen=True)
@@ -55,13 +53,19 @@ class List:
 def _inputs() -> "Iterator[Table]":
     from importlib.metadata import entry_points
 
+    from wbc_bench.errors import BenchError, ControllerError
     from wbc_bench.isolation import blamed
     from wbc_bench.results.table import Table
 
     for point in sorted(entry_points(group=INPUTS), key=lambda point: point.name):
         header = ("Vector", "Columns", "Size", "Term", "Unit")
-        with blamed(f"inputs of '{point.name}' cannot be listed"):
-            rows = tuple(point.load()())
+        try:
+            with blamed("cannot be listed"):
+                rows = tuple(tuple(map(str, row)) for row in point.load()())
+                if {len(row) for row in rows} - {len(header)}:
+                    raise ControllerError(f"cannot be listed: a row has other columns than {header}")
+        except BenchError as error:  # somebody else's code: the others are still listed
+            rows = ((str(error), "", "", "", ""),)
         yield Table(point.name, f"Inputs of {point.name}", header, rows)
 
 
@@ -280,10 +284,11 @@ class Bench:
         for name in self.names or sorted(found):
             with blamed(f"benchmark '{name}' failed"):
                 frame = found[name].load()()
-            cells = [
-                tuple(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) for row in frame.values
-            ]
-            table = Table(name, f"Benchmark {name}", tuple(map(str, frame.columns)), tuple(cells), data=frame)
+                cells = [
+                    tuple(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) for row in frame.values
+                ]
+                header = tuple(map(str, frame.columns))
+            table = Table(name, f"Benchmark {name}", header, tuple(cells), data=frame)
             print_table(table)
             if self.out:
                 with made_whole(self.out) as (made, _):
