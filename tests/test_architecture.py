@@ -22,8 +22,8 @@ LAYERS = (
     ("controller",),
     ("episodes",),
     ("robot", "results", "tensors"),
+    ("provenance",),
     (
-        "provenance",
         "progress",
         "outcomes",
         "files",
