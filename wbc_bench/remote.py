@@ -163,16 +163,27 @@ def _packed(array: NDArray) -> dict[str, Any]:
     return {"dtype": array.dtype.str, "shape": array.shape, "data": array.tobytes()}
 
 
-def make(robot: Robot, variant: str = "") -> Controller:
-    """The controller of `remote:ADDRESS`, or `remote:ADDRESS?timeout=SECONDS`. Raises: ControllerError."""
-    address, _, query = variant.partition("?")
-    key, _, value = query.partition("=")
-    try:
-        timeout = float(value) if query else TIMEOUT
-    except ValueError:
-        timeout = float("nan")
-    if "://" not in address or (query and key != "timeout") or not 0 < timeout < 3600:
-        raise ControllerError(
-            f"controller 'remote:{variant}', valid: remote:tcp://127.0.0.1:PORT or ...:PORT?timeout=SECONDS"
-        )
-    return RemoteController(robot, address, timeout)
+class Remote:
+    """The entry point of policies in other processes."""
+
+    def __call__(self, robot: Robot, variant: str = "") -> Controller:
+        """The controller of `remote:ADDRESS` or `remote:ADDRESS?timeout=SECONDS`. Raises: ControllerError."""
+        address, _, query = variant.partition("?")
+        key, _, value = query.partition("=")
+        try:
+            timeout = float(value) if query else TIMEOUT
+        except ValueError:
+            timeout = float("nan")
+        if "://" not in address or (query and key != "timeout") or not 0 < timeout < 3600:
+            raise ControllerError(
+                f"controller 'remote:{variant}', valid: remote:tcp://127.0.0.1:PORT or "
+                "...:PORT?timeout=SECONDS"
+            )
+        return RemoteController(robot, address, timeout)
+
+    def variants(self) -> list[tuple[str, str]]:
+        """Return the form of a variant, with its description."""
+        return [("tcp://HOST:PORT", "A policy in another process, asked at every control step.")]
+
+
+make = Remote()
