@@ -14,6 +14,7 @@ PACKAGES = {"wbc_bench": ROOT / "wbc_bench", "wbc_baselines": ROOT / "baselines"
 LAYERS = (
     ("__main__",),
     ("cli",),
+    ("board",),
     ("publish", "viewer"),
     ("evaluation",),
     ("policies", "remote"),

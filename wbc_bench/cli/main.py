@@ -12,6 +12,7 @@ from typing import Annotated, get_args
 import tyro
 from tyro.conf import subcommand
 
+from wbc_bench.cli.board import Board, Submit
 from wbc_bench.cli.common import THREADS, run_command
 from wbc_bench.cli.doors import DemoEval, DemoRecord, DemoTrain
 from wbc_bench.cli.evaluate import Ablation, Eval, Reach, Stress
@@ -42,6 +43,8 @@ Command = (
     | Annotated[Compare, subcommand("compare")]
     | Annotated[Report, subcommand("report")]
     | Annotated[Latent, subcommand("latent")]
+    | Annotated[Submit, subcommand("submit")]
+    | Annotated[Board, subcommand("board")]
     | Annotated[List, subcommand("list")]
     | Annotated[
         Annotated[Freeze, subcommand("freeze")]

@@ -19,6 +19,10 @@ from wbc_bench.results.analysis import (
 from wbc_bench.results.formatting import CM, DEG, number_text, window_text
 
 SHOWN = 10  # episodes an outcome
+REPLAYED = (
+    " Run a command in the folder of this report; the page it writes is linked here by the next "
+    "`wbc-bench report`."
+)
 
 
 def order_text(rule: SuccessRule) -> str:
@@ -27,9 +31,7 @@ def order_text(rule: SuccessRule) -> str:
         f"At most {SHOWN} episodes of each outcome, the worst first. Of episodes that terminated, the worst "
         f"ended first; of the others, it has the largest error over the {window_text(rule)}: the position's "
         f"in units of {rule.position * CM:g} cm or the orientation's in units of "
-        f"{rule.orientation * DEG:g}°, whichever is more. Equals come in the order of replicate and episode. "
-        "Run a command in the folder of this report; the page it writes is linked here by the next "
-        "`wbc-bench report`."
+        f"{rule.orientation * DEG:g}°, whichever is more. Equals come in the order of replicate and episode."
     )
 
 
@@ -54,11 +56,18 @@ def replay_path(protocol: str, controller: str, replicate: int, episode: int) ->
     return f"replays/{_run(protocol, controller, replicate)}/{episode}.html"
 
 
-def replay_command(protocol: str, controller: str, replicate: int, episode: int, records: str = ".") -> str:
-    """What writes it, in the folder of the report, from which `records` leads to that of the records."""
+def replay_command(
+    protocol: str, controller: str, replicate: int, episode: int, records: str = ".", resolved: str = ""
+) -> str:
+    """What writes it, in the folder of the report, from which `records` leads to that of the records.
+
+    `resolved` is the spec that met the replicate, where a run stands under another name than that.
+    """
     run = _run(protocol, controller, replicate)
     page = replay_path(protocol, controller, replicate, episode)
-    code = "" if is_installed(controller) else f" --controller {shlex.quote(controller)}"
+    spec = resolved or controller
+    shipped = is_installed(controller) and spec.startswith(controller)
+    code = "" if shipped else f" --controller {shlex.quote(spec)}"
     return f"wbc-bench replay {run} --episode {episode} --results {shlex.quote(records)} -o {page}{code}"
 
 
@@ -72,6 +81,7 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path, records: str = 
     texts = ("Outcome", "Replicate", "Episode", "Stratum", *(name.capitalize() for name in kinds))
     numbers = ("Target x (m)", "y (m)", "Height (m)", "Position error (cm)", "Orientation error (deg)")
     outcomes = np.asarray(episodes["outcome"], dtype=str)
+    resolved = {record.replicate: record.resolved_controller or "" for record in method.records}
     rows = []
     for outcome in (*(each for each in Outcome if each != Outcome.SUCCESS), Outcome.SUCCESS):
         for k, row in enumerate(worst(episodes, outcome, method.rule).to_dict("records")):
@@ -93,7 +103,7 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path, records: str = 
             )
             text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
             text += "".join(f'<td class="number">{value}</td>' for value in values)
-            text += f"<td>{_replay(where, beside, records)}</td>"
+            text += f"<td>{_replay(where, beside, records, resolved[where[2]])}</td>"
             rows.append(f'<tr class="group">{text}</tr>' if k == 0 else f"<tr>{text}</tr>")
     head = "".join(f"<th>{name}</th>" for name in texts)
     head += (
@@ -107,11 +117,11 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path, records: str = 
     )
 
 
-def _replay(where: tuple[str, str, int, int], beside: Path, records: str) -> str:
+def _replay(where: tuple[str, str, int, int], beside: Path, records: str, resolved: str) -> str:
     path = replay_path(*where)
     if (beside / path).is_file():
         return f'<a href="{html.escape(path)}">watch</a>'
-    return f"<code>{html.escape(replay_command(*where, records))}</code>"
+    return f"<code>{html.escape(replay_command(*where, records, resolved))}</code>"
 
 
 def _run(protocol: str, controller: str, replicate: int) -> str:

@@ -200,7 +200,7 @@ def write(
         images = [figure_html(_figure(root, stem), _caption(stem, rule)) for stem in stems]
         parts = [*shown[:1], *images, *shown[1:]]  # what most readers came for, first
         if protocol in protocols:
-            parts.append(f'<p class="rule">{code_html(gallery.order_text(rule))}</p>\n')
+            parts.append(f'<p class="rule">{code_html(gallery.order_text(rule) + gallery.REPLAYED)}</p>\n')
             methods = evaluated[protocol].values()
             parts += [gallery.gallery_html(protocol, method, beside, records_at) for method in methods]
         if parts:
