@@ -33,6 +33,7 @@ READERS = {
     "sealed set": Reader(inputs.write_sealed_set, inputs.read_sealed_set, inputs.seal_sealed_set),
     "study": Reader(inputs.write_studies, inputs.read_studies),
     "ladder": Reader(inputs.write_ladders, inputs.read_ladders),
+    "submission": Reader(records.write_submissions, records.read_submissions),
     "climb": Reader(records.write_climbs, records.read_climbs, records.seal_climbs),
     "script": Reader(inputs.write_scripts, inputs.read_scripts),
     "code": Reader(inputs.write_code, inputs.read_code),

@@ -4,6 +4,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -17,7 +18,7 @@ from wbc_bench.results.doors import door_table, read_doors, write_doors
 from wbc_bench.results.margins import analyse
 from wbc_bench.results.report import figure_html, given_caption
 from wbc_bench.results.run_writer import RunWriter
-from wbc_bench.results.store import ResultStore, RunKey, ShardCost
+from wbc_bench.results.store import ResultStore, Run, RunKey, ShardCost
 from wbc_bench.results.stress import (
     FactorRecord,
     LadderRecord,
@@ -27,6 +28,7 @@ from wbc_bench.results.stress import (
     stress_folder,
 )
 from wbc_bench.results.study import Study
+from wbc_bench.results.submission import pack, read_submission
 from wbc_bench.results.table import Table, read_markdown
 from wbc_bench.results.tables.reach import reach_table
 from wbc_bench.results.tables.strata import outcome_table, stratum_table
@@ -74,6 +76,22 @@ def read_runs(folder: Path) -> None:
 def seal_runs(folder: Path) -> None:
     for path in folder.glob("runs/*/*/*/run.json"):
         reseal(path, "episodes_sha256", path.with_name("episodes.parquet"))
+
+
+def write_submissions(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        write_runs(Path(scratch))
+        known = {"resolved_controller": "a:b", "controller_sha256": "a" * 64}
+        runs = [
+            Run(run.path, msgspec.structs.replace(run.record, **known))
+            for run in ResultStore(scratch).runs("mine")
+        ]
+        (folder / "mine.zip").write_bytes(pack("mine", runs, "a card"))
+
+
+def read_submissions(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        assert read_submission(folder / "mine.zip", Path(scratch)).name == "mine"
 
 
 def write_climbs(folder: Path) -> None:
