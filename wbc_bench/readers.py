@@ -120,10 +120,11 @@ def read_parquet(
     error: type[BenchError],
     columns: Mapping[str, str] | None = None,
     rows: int | None = None,
+    only: list[str] | None = None,
     **options: Any,
 ) -> "pa.Table":
     """The table of a parquet file. Raises: `error`: see `read_bytes` and `decode_parquet`."""
-    return decode_parquet(read_bytes(path, kind, error), path, kind, error, columns, rows, **options)
+    return decode_parquet(read_bytes(path, kind, error), path, kind, error, columns, rows, only, **options)
 
 
 def decode_parquet(
@@ -133,6 +134,7 @@ def decode_parquet(
     error: type[BenchError],
     columns: Mapping[str, str] | None = None,
     rows: int | None = None,
+    only: list[str] | None = None,
     **options: Any,
 ) -> "pa.Table":
     """The table of the bytes of a parquet file.
@@ -144,6 +146,7 @@ def decode_parquet(
         error: The error to raise.
         columns: Columns that the table must have, with the names of their types in arrow.
         rows: Number of rows that it must have.
+        only: Names of the columns to read, as far as they are there; all when None.
         options: Of `pyarrow.parquet.ParquetFile`.
 
     Raises:
@@ -165,7 +168,7 @@ def decode_parquet(
             )
         if rows is not None and found != rows:
             raise error(f"{kind} '{path}' has {found} rows, valid: {rows}")
-        table = file.read()
+        table = file.read(columns=only)
         table.validate(full=True)
     check_columns(table, path, kind, error, columns or {})
     return table

@@ -27,8 +27,10 @@ class Track:
     """Controllers to score, each a name, name:variant, module:attribute or file.py:attribute."""
     source: tuple[str, ...] = tyro.MISSING
     """Sources of the target, each the name of a released script, the path of a .toml file, `stream`,
-    `stream:SCRIPT` to send a script through a stream, `diffusion[:FILE]` for a policy in front of a door, or
-    `live` for a person who drags the target in a page."""
+    `stream:SCRIPT` to send a script through a stream, `diffusion[:FILE]` for a policy in front of a door,
+    FILE?KEY=VALUE&... for a recorded trajectory (.csv, .parquet, .zarr.zip, .pkl, or the folder of a LeRobot
+    dataset; keys episode, rate, frame, tool, feature), or `live` for a person who drags the target in a
+    page."""
     duration: float | None = None
     """Duration of each episode [s]; when not given, that of the script, and 20 s for other sources."""
     seed: int = 0

@@ -20,6 +20,7 @@ from wbc_bench.results.tracking import STOOD, Series, Tracked
 from wbc_bench.robot import Robot, load_robot, mount_of
 from wbc_bench.sources.interface import SceneSource, Seen, Source, to_world
 from wbc_bench.sources.message import MessageStatus
+from wbc_bench.sources.recorded.recording import RecordedSource
 from wbc_bench.sources.registry import recorded_name
 from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import ScriptedSource
@@ -135,30 +136,32 @@ def seen_of(state: State, robot: Robot, index: int = 0) -> Seen:
 
 
 def natural_duration(source: Source) -> float:
-    """[s] until a script begun from the default posture has ended, and STAY; UNSCRIPTED for other sources.
+    """[s] until a script or recording has ended, begun from the default posture, and STAY; else UNSCRIPTED.
 
-    Raises: SourceError, the script lasts longer than an episode may.
+    Raises: SourceError, it lasts longer than an episode may.
     """
-    script = source.script if isinstance(source, ScriptedSource | ReplayedStream) else None
-    if script is None:
+    if isinstance(source, ScriptedSource | ReplayedStream):
+        played = ScriptedSource(source.script)
+    elif isinstance(source, RecordedSource):
+        played = source
+    else:
         return UNSCRIPTED
     protocol = _protocol(UNSCRIPTED, seed=0)
     state = Simulation(protocol, _row(protocol, "nominal")).state()
-    played = ScriptedSource(script)
     played.reset(seen_of(state, load_robot(protocol.robot)))
     if not played.path.duration + STAY <= LONGEST:
         raise SourceError(
-            f"the script lasts {played.path.duration:.4g} s, valid: at most {LONGEST - STAY:g} s, "
+            f"it lasts {played.path.duration:.4g} s, valid: at most {LONGEST - STAY:g} s, "
             "or a duration that plays a part of it"
         )
     return math.ceil(played.path.duration + STAY)
 
 
 def _digest(source: Source) -> str | None:
-    """SHA-256 of the script or the policy that decides the targets."""
+    """SHA-256 of the script, the recording or the policy that decides the targets."""
     if isinstance(source, ScriptedSource | ReplayedStream):
         return source.script.digest
-    return source.digest if isinstance(source, SceneSource) else None
+    return source.digest if isinstance(source, SceneSource | RecordedSource) else None
 
 
 def facts(controller: Controller, spec: str, source: Source, condition: str, seed: int) -> dict:

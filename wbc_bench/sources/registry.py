@@ -9,6 +9,8 @@ from wbc_bench.errors import SourceError, UnknownNameError, missing_extra
 from wbc_bench.files import PROTOCOLS
 from wbc_bench.sources.interface import Source
 from wbc_bench.sources.live import LIVE, LiveSource
+from wbc_bench.sources.recorded.files import is_recording, load_recording
+from wbc_bench.sources.recorded.recording import RecordedSource
 from wbc_bench.sources.replayed_stream import ReplayedStream
 from wbc_bench.sources.scripted import Script, ScriptedSource, load_script
 from wbc_bench.sources.stream import ADDRESS, StreamSource
@@ -39,7 +41,9 @@ def find_script(name: str) -> Script:
     if name.endswith(".toml"):
         return load_script(Path(name))
     if name not in script_names():
-        raise UnknownNameError("source", name, source_names(), "--source; or give a .toml file")
+        raise UnknownNameError(
+            "source", name, source_names(), "--source; or give the file of a script or a recording"
+        )
     return load_script(SCRIPTS / f"{name}.toml")
 
 
@@ -66,6 +70,8 @@ def check_source(name: str) -> None:
     """
     if _is_diffusion(name):
         find_policy(name.partition(":")[2])
+    elif is_recording(name):
+        load_recording(name)
     elif name not in (LIVE, "stream"):
         find_script(name.removeprefix("stream:"))
 
@@ -77,8 +83,9 @@ def load_source(
     protocol: EvalProtocol | None = None,
     config: StreamConfig = StreamConfig(),  # noqa: B008  (immutable)
 ) -> Source:
-    """The source of a name: `live`, `stream`, a script of the library or of a .toml file, `stream:SCRIPT`, or
-    `diffusion[:FILE]`, which stands in front of the first door of the protocol's seed.
+    """The source of a name: `live`, `stream`, a script of the library or of a .toml file, `stream:SCRIPT`,
+    a recording (see `recorded.files`), or `diffusion[:FILE]`, which stands in front of the first door of the
+    protocol's seed.
 
     Address, `allow_remote` and `config` are those of a stream.
 
@@ -92,6 +99,8 @@ def load_source(
         protocol = protocol or find_protocol("ablation_v1")[0]
         seed = protocol.episodes.seed
         return DiffusionSource(policy, draw_door(protocol, seed, 0), seed, digest=digest)
+    if is_recording(name):
+        return RecordedSource(load_recording(name))
     if name == LIVE:
         return LiveSource()
     if name == "stream":

@@ -12,7 +12,7 @@ from wbc_bench.errors import SourceError
 from wbc_bench.files import write_atomic
 from wbc_bench.rotations import matrix_from_rotvec, rotvec_from_matrix
 from wbc_bench.sources.diffusion import poses
-from wbc_bench.sources.diffusion.zarr_archive import MAX_ROWS, read_archive, zarr_module
+from wbc_bench.sources.diffusion.zarr_archive import MAX_ROWS, episode_slices, read_archive, zarr_module
 from wbc_bench.sources.slew import Pose
 
 Array = NDArray[np.float64]
@@ -110,11 +110,9 @@ def read_demonstrations(path: Path) -> Demonstrations:
     if "action" not in arrays:
         parts = ("robot0_eef_pos", "robot0_eef_rot_axis_angle", "robot0_gripper_width")
         arrays["action"] = np.concatenate([arrays[name] for name in parts], axis=-1)
+    slices = episode_slices(path, ends)
     _check(path, arrays, ends)
-    episodes = [
-        _demonstration({name: value[start:end] for name, value in arrays.items()})
-        for start, end in zip([0, *ends[:-1]], ends, strict=True)
-    ]
+    episodes = [_demonstration({name: value[rows] for name, value in arrays.items()}) for rows in slices]
     return Demonstrations(episodes, found.attributes, found.sha256)
 
 
@@ -145,8 +143,6 @@ def _demonstration(arrays: dict[str, Array]) -> Demonstration:
 
 
 def _check(path: Path, arrays: dict[str, Array], ends: NDArray[np.int64]) -> None:
-    if not (len(ends) > 0 and ends[0] > 0 and bool((np.diff(ends) > 0).all())):
-        raise SourceError(f"demonstrations '{path}': meta/episode_ends must rise from above 0")
     for name, value in arrays.items():
         where = f"demonstrations '{path}': data/{name}"
         if len(value) != ends[-1]:

@@ -113,6 +113,13 @@ def read_archive(path: Path, wanted: Mapping[str, int], optional: frozenset[str]
     return Archive(found, attributes if isinstance(attributes, dict) else {}, digest)
 
 
+def episode_slices(path: Path, ends: NDArray[np.int64]) -> list[slice]:
+    """The rows of each episode of a file. Raises: SourceError, `ends` (E,) do not rise from above 0."""
+    if not (len(ends) > 0 and ends[0] > 0 and bool((np.diff(ends) > 0).all())):
+        raise SourceError(f"{KIND} '{path}': meta/episode_ends must rise from above 0")
+    return [slice(int(start), int(end)) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
 def _check_present(path: Path, names: list[str], sizes: Mapping[str, int]) -> None:
     missing = [name for name in names if f"{name}/.zarray" not in sizes]
     if not missing:

@@ -1,0 +1,1 @@
+"""End-effector trajectories that others recorded, as sources of moving targets."""
