@@ -354,7 +354,7 @@ def entry(rng: Rng, data: bytes) -> bytes:
 _TEXT: list[tuple[str, Mutation]] = [("number", number), ("string", string), ("lines", lines), ("nest", nest)]
 _TABLES = [(change.__name__, _table(change)) for change in _COLUMNS]
 _OF_SUFFIX: dict[str, list[tuple[str, Mutation]]] = {
-    **dict.fromkeys((".toml", ".md", ".txt", ".sha256", ".jsonl", ".tex"), _TEXT),
+    **dict.fromkeys((".toml", ".md", ".txt", ".sha256", ".jsonl", ".tex", ".csv"), _TEXT),
     ".json": [*_TEXT, ("value", json_value), ("value", json_value), ("value", json_value)],
     ".parquet": [*_TABLES, *_TABLES, ("inflate", _table(inflate))],
     ".safetensors": [("tensors", tensors)] * 4,

@@ -12,6 +12,7 @@ import numpy as np
 
 import damaged_cards as cards
 import damaged_inputs as inputs
+import damaged_recordings as recordings
 import damaged_records as records
 import damaged_training as learned
 from damage import damage
@@ -50,6 +51,7 @@ READERS = {
     "door policy": Reader(learned.write_door_policy, learned.read_door_policy),
     "training": Reader(learned.write_training, learned.read_training),
     "targets": Reader(learned.write_targets, learned.read_targets),
+    "recordings": Reader(recordings.write_recordings, recordings.read_recordings),
     "demonstrations": Reader(learned.write_demonstration_files, learned.read_demonstration_files),
 }
 

@@ -26,6 +26,7 @@ _CALLS = {  # names that numpy writes into a pickle; none of them is looked up
     *((module, name) for module in _NUMPY for name in ("_reconstruct", "ndarray", "dtype", "scalar")),
     *((module, "_frombuffer") for module in _NUMPY),
     ("_codecs", "encode"),  # of bytes, in protocol 2
+    ("__builtin__", "bytes"),  # of none, there
 }
 
 
@@ -197,6 +198,8 @@ def _call(call: Any, arguments: Any) -> Any:
             return _Array(shape, kind, bytes(data), order)
         case _Name("encode"), (str(text), "latin1"):
             return text.encode("latin1")
+        case _Name("bytes"), ():
+            return b""
     raise ValueError("a call that no array needs")
 
 
