@@ -18,7 +18,10 @@ TABLE = dict(zip(POSE, POSES.T, strict=True))
 
 
 def write_recordings(folder: Path) -> None:
-    lines = [",".join(("t", *POSE)), *(",".join(f"{v:.4f}" for v in (k, *row)) for k, row in enumerate(POSES))]
+    lines = [
+        ",".join(("t", *POSE)),
+        *(",".join(f"{v:.4f}" for v in (k, *row)) for k, row in enumerate(POSES)),
+    ]
     (folder / "a.csv").write_text("# frame=world\n# tool=ee\n" + "\n".join(lines) + "\n")
     said = {"rate": "50", "frame": "start", "tool": "umi"}
     pq.write_table(pa.table(TABLE).replace_schema_metadata(said), folder / "a.parquet")
@@ -43,4 +46,6 @@ def read_recordings(folder: Path) -> None:
     names = ["a.csv", "a.parquet", "a.zarr.zip?episode=1", "dataset?episode=1"]
     for name in (*names, *(f"{protocol}.pkl?episode=1&frame=start" for protocol in (2, 4, 5))):
         found = load_recording(f"{folder}/{name}")
-        assert np.isfinite(found.pos).all() and np.isfinite(found.rot).all() and (np.diff(found.time) > 0).all()
+        assert (
+            np.isfinite(found.pos).all() and np.isfinite(found.rot).all() and (np.diff(found.time) > 0).all()
+        )

@@ -19,7 +19,7 @@ from wbc_bench.cli.evaluate import Ablation, Eval, Reach, Stress
 from wbc_bench.cli.lists import Bench, ExportController, List
 from wbc_bench.cli.policy import PolicyCheck, PolicyImport, PolicyTerms
 from wbc_bench.cli.protocol import Freeze, Reveal, Show, Verify
-from wbc_bench.cli.replay import Film, Replay
+from wbc_bench.cli.replay import ExportDataset, Film, Replay
 from wbc_bench.cli.results import Compare, Latent, Report
 from wbc_bench.cli.robot import Export, Picture
 from wbc_bench.cli.tracking import Live, Track
@@ -34,6 +34,7 @@ Command = (
     | Annotated[Live, subcommand("live")]
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Film, subcommand("film")]
+    | Annotated[ExportDataset, subcommand("export-dataset")]
     | Annotated[
         Annotated[DemoRecord, subcommand("record")]
         | Annotated[DemoTrain, subcommand("train")]

@@ -1,4 +1,4 @@
-"""`wbc-bench replay` and `film`: an episode of a stored run again."""
+"""`wbc-bench replay`, `film` and `export-dataset`: episodes of a stored run again."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +14,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _Again:
+class _Stored:
     name: Annotated[Positional[str], tyro.conf.arg(name="run")]
     """Folder of a stored run, or <protocol>/<controller>/replicate_<k> of the records."""
-    episode: int = tyro.MISSING
-    """Index of the episode in its replicate, counted from 0."""
     results: Path = RESULTS
     """Folder to read the records from."""
     protocol: str | None = None
@@ -35,6 +33,12 @@ class _Again:
         if (Path(self.name) / "run.json").exists():
             return ResultStore(self.results).find(self.name)
         return open_records(self.results).find(self.name)
+
+
+@dataclass(frozen=True)
+class _Again(_Stored):
+    episode: int = tyro.MISSING
+    """Index of the episode in its replicate, counted from 0."""
 
 
 @dataclass(frozen=True)
@@ -98,3 +102,36 @@ class Film(_Again):
             write_png(pixels, self.strip)
             write_atomic(self.strip.with_suffix(".txt"), strip_caption(again, self.times).encode())
             print(self.strip)
+
+
+@dataclass(frozen=True)
+class ExportDataset(_Stored):
+    """Run episodes of a stored run again and write them as a LeRobot dataset (version 3, no pictures)."""
+
+    episodes: tuple[int, ...] = (0,)
+    """Indices of the episodes in their replicate, counted from 0."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("dataset")
+    """Folder to write, which must not exist yet."""
+
+    def run(self) -> None:
+        drawing()
+        from wbc_bench.errors import StoreError
+        from wbc_bench.files import ensure_writable
+        from wbc_bench.progress import Progress
+        from wbc_bench.viewer.dataset import write_episodes
+
+        if not self.episodes or len(set(self.episodes)) < len(self.episodes):
+            raise UsageError("--episodes: valid: at least one index, each once")
+        if self.out.exists():
+            raise StoreError(f"'{self.out}' exists, valid: a folder that does not exist yet")
+        ensure_writable(self.out.parent)
+        run = self._find()
+        with Progress("steps") as progress:
+            seen = write_episodes(
+                run, self.episodes, self.out, self.protocol, progress.update, self.controller
+            )
+        verified = sum(not again.differences for again in seen)
+        for again in seen:
+            if again.differences:
+                print(f"{again.title}: {again.verdict}")
+        print(f"{self.out}: {len(seen)} episodes, {verified} verified against their records")

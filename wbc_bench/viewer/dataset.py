@@ -38,27 +38,20 @@ def write_episodes(
     protocol = seen[0].protocol
     rate = 1 / protocol.control_period  # [Hz]
     if abs(rate - round(rate)) > 1e-9 * rate:
-        raise StoreError(f"'{run.path}' has a control rate of {rate:g} Hz, valid: whole numbers for a dataset")
+        raise StoreError(
+            f"'{run.path}' has a control rate of {rate:g} Hz, valid: whole numbers for a dataset"
+        )
     about = {"protocol": run.record.protocol, "controller": run.record.controller, "frame": "world"}
     about |= {"tool": "ee", "quaternion": "qw, qx, qy, qz"}
     episodes = [_episode(again) for again in seen]
-    write_dataset(folder, episodes, NAMES, round(rate), f"{seen[0].robot.facts.name}", about)
+    write_dataset(folder, episodes, NAMES, round(rate), f"tron1_l5_{seen[0].robot.config.variant}", about)
     return seen
 
 
 def _episode(again: Rerun) -> Episode:
     """One episode; a controller that is faster than the protocol has several moments in a frame."""
     period = again.protocol.control_period
-    steps = [round(moment.time / period) for moment in again.moments]
-    first = np.unique(steps, return_index=True)[1]
-    # that of a faster controller: the moment nearest to the frame
-    moments = [
-        min(
-            (m for m, step in zip(again.moments, steps, strict=True) if step == steps[k]),
-            key=lambda m: abs(m.time - round(m.time / period) * period),
-        )
-        for k in first
-    ]
+    moments = [m for m in again.moments if abs(m.time / period - round(m.time / period)) < 1e-6]
     target, hand = (
         np.array([[*pos, *wxyz_from_matrix(rot)] for pos, rot in pairs])
         for pairs in (
