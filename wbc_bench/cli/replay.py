@@ -109,7 +109,7 @@ class ExportDataset(_Stored):
     """Run episodes of a stored run again and write them as a LeRobot dataset (version 3, no pictures)."""
 
     episodes: tuple[int, ...] = (0,)
-    """Indices of the episodes in their replicate, counted from 0."""
+    """Index of each episode in its replicate, counted from 0."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("dataset")
     """Folder to write, which must not exist yet."""
 
