@@ -215,8 +215,8 @@ def test_command_is_default_plus_scaled_action(stream):
         np.testing.assert_allclose(command, robot.default_q + scale * found["action"].numpy(), atol=1e-12)
 
 
-def test_another_period_is_refused(smoke: EvalProtocol, calm_rows: CalmRows):
-    slower = msgspec.structs.replace(smoke, physics=msgspec.structs.replace(smoke.physics, decimation=20))
+def test_a_period_that_does_not_divide_is_refused(smoke: EvalProtocol, calm_rows: CalmRows):
+    slower = msgspec.structs.replace(smoke, physics=msgspec.structs.replace(smoke.physics, decimation=15))
     with pytest.raises(BenchError, match=r"every 0\.02 s"):
         rollout(make("no_latent"), slower, calm_rows(2))
 
