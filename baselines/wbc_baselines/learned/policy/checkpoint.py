@@ -104,7 +104,7 @@ def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
     """Load a checkpoint that can initialize a method with this estimator, see `shared_context`.
 
     Args:
-        name: METHOD@SEED or PATH.safetensors.
+        name: METHOD@SEED, ROBOT/METHOD@SEED for one of another robot, or PATH.safetensors.
         estimator: Name of the estimator of the method to train.
         robot: Variant of the robot to train for.
 
@@ -115,7 +115,9 @@ def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
         CheckpointError: It has a different estimator; and see `load`.
         UnknownNameError: There is no such checkpoint.
     """
-    found = load(find(name, robot))
+    theirs_robot, slash, rest = name.rpartition("/")
+    of_a_robot = slash and not name.endswith(".safetensors")
+    found = load(find(rest, theirs_robot) if of_a_robot else find(name, robot))
     theirs = METHODS[found.card.method]
     if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(

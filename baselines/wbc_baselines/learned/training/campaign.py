@@ -29,7 +29,8 @@ def runs_of(recipe: Recipe, methods: Sequence[str], seeds: int, out: Path) -> li
     """List the configurations of all methods and seeds, ordered by seed, each seed's oracle first.
 
     A campaign that is cut short has then trained all methods with the same seeds. Every seed has an oracle of
-    its own, from which its other methods are distilled, so that seeds are independent.
+    its own, from which its other methods are distilled, so that seeds are independent as far as the oracles
+    are: those of a recipe with an ancestor begin with the same weights.
 
     Args:
         recipe: Settings of the runs.
@@ -52,7 +53,10 @@ def runs_of(recipe: Recipe, methods: Sequence[str], seeds: int, out: Path) -> li
         oracle = str(RunFolder(out / f"{ORACLE}@{seed}").checkpoint)
         for method in wanted:
             if method == ORACLE or recipe.distilled is None:
-                settings = recipe.from_scratch | {"init_checkpoint": "", "teacher": ""}
+                settings = recipe.from_scratch | {
+                    "init_checkpoint": recipe.ancestor if method == ORACLE else "",
+                    "teacher": "",
+                }
             else:
                 settings = recipe.distilled | {"init_checkpoint": oracle, "teacher": oracle}
             runs.append(_config(recipe, settings | {"method": method, "seed": seed}))

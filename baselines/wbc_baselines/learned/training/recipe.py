@@ -1,4 +1,4 @@
-"""Recipes: the settings of all runs of a campaign, from random weights on, in one TOML file."""
+"""Recipes: the settings of all runs of a campaign in one TOML file."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -19,9 +19,9 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     common: dict[str, Any]
-    from_scratch: dict[
-        str, Any
-    ]  # from random weights: the oracle, or every method where nothing is distilled
+    # without a teacher: the oracle, or every method where nothing is distilled
+    from_scratch: dict[str, Any]
+    ancestor: str = ""  # checkpoint of any robot that initializes the oracle; "" for random weights
     distilled: dict[str, Any] | None = None  # the other methods, beginning with and taught by the oracle
 
 
