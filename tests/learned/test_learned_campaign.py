@@ -83,7 +83,18 @@ def test_a_campaign_from_scratch_has_no_teacher(tmp_path):
 
 def test_the_recipes_of_the_package_can_be_run(tmp_path):
     for name in recipe_names():
-        runs_of(find_recipe(name), list(METHODS), 3, tmp_path)
+        runs = runs_of(find_recipe(name), list(METHODS), 3, tmp_path)
+        assert len(runs) == 3 * len(METHODS)
+        for run in runs:  # what an oracle begins with is there
+            if run.method == "oracle" and run.init_checkpoint:
+                checkpoint.load_init_checkpoint(run.init_checkpoint, "oracle", robot="paper")
+
+
+def test_an_oracle_may_begin_with_one_of_another_robot(tmp_path):
+    found = checkpoint.load_init_checkpoint("limx_adapter/oracle@0", "oracle", robot="paper")
+    assert found.card.method == "oracle"
+    with pytest.raises(UnknownNameError, match=r"'oracle@7'"):
+        checkpoint.load_init_checkpoint("limx_adapter/oracle@7", "oracle", robot="paper")
 
 
 @pytest.mark.parametrize(

@@ -104,7 +104,7 @@ def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
     """Load a checkpoint that can initialize a method with this estimator, see `shared_context`.
 
     Args:
-        name: METHOD@SEED, ROBOT/METHOD@SEED for one of another robot, or PATH.safetensors.
+        name: METHOD@SEED, ROBOT/METHOD@SEED or PATH.safetensors.
         estimator: Name of the estimator of the method to train.
         robot: Variant of the robot to train for.
 
@@ -115,9 +115,7 @@ def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
         CheckpointError: It has a different estimator; and see `load`.
         UnknownNameError: There is no such checkpoint.
     """
-    theirs_robot, slash, rest = name.rpartition("/")
-    of_a_robot = slash and not name.endswith(".safetensors")
-    found = load(find(rest, theirs_robot) if of_a_robot else find(name, robot))
+    found = load(find(name, robot))
     theirs = METHODS[found.card.method]
     if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(
@@ -168,7 +166,8 @@ def find(name: str, robot: str) -> Path:
     """Find the file of a checkpoint.
 
     Args:
-        name: METHOD@SEED of a checkpoint of this package, or PATH.safetensors.
+        name: METHOD@SEED of a checkpoint of this package, ROBOT/METHOD@SEED for another robot's, or
+            PATH.safetensors.
         robot: Variant of the robot, of which each has checkpoints of its own.
 
     Returns:
@@ -179,6 +178,8 @@ def find(name: str, robot: str) -> Path:
     """
     if name.endswith(".safetensors"):
         return Path(name)
+    their_robot, _, name = name.rpartition("/")
+    robot = their_robot or robot
     path = CHECKPOINTS / robot / f"{name}.safetensors"
     if not is_file(path):
         known = available(robot)
