@@ -20,7 +20,8 @@ main(sys.argv[2:])
 # module that is hidden, package and extra in the message, command
 CASES = [
     ("pinocchio", "pin", "ik", ("eval", "--controller", "ik", "--protocol", "smoke_v1")),
-    ("placo", "placo", "ik", ("eval", "--controller", "ik:standing", "--protocol", "smoke_v1")),
+    ("daqp", "daqp", "ik", ("eval", "--controller", "ik:standing", "--protocol", "smoke_v1")),
+    ("placo", "placo", "ik", ("eval", "--controller", "ik:placo", "--protocol", "smoke_v1")),
     ("osqp", "osqp", "ik", ("eval", "--controller", "ik:osqp", "--protocol", "smoke_v1")),
     ("torch", "torch", "learned", ("eval", "--controller", "learned:none@0", "--protocol", "smoke_v1")),
     ("onnxruntime", "onnxruntime", "policy", ("policy", "import", "pyproject.toml")),

@@ -7,7 +7,7 @@ import pytest
 from wbc_baselines.ik import make
 from wbc_baselines.ik.config import TUNED
 from wbc_baselines.ik.controller import ARM, PERIOD
-from wbc_baselines.ik.load import GainObserver, PayloadObserver
+from wbc_baselines.ik.load import GainObserver, Payload
 from wbc_baselines.ik.model import WholeBodyModel, configuration
 from wbc_bench.robot import RobotConfig, load_robot
 
@@ -32,20 +32,21 @@ def test_the_payload_is_what_the_arm_carries_beyond_its_own_weight():
     MODEL.update(q)
     own, hand = MODEL.gravity_torques(q)[6:], MODEL.jacobian(MODEL.tcp)[:, 14:]
     with_load = loaded.gravity_torques(q)[6:]
-    observer = PayloadObserver(PERIOD, TUNED)
+    payload, seen, lift = Payload(np.zeros(2), np.zeros(2)), np.array([True, False]), np.tile(hand[2], (2, 1))
     for _ in range(300):
-        noise = rng.uniform(-0.8, 0.8, 6)
-        observer.update(hand, own[ARM], with_load[ARM] + noise)
-    assert observer.mass == pytest.approx(mass, abs=0.03)
+        noise = rng.uniform(-0.8, 0.8, (2, 6))
+        payload.update(TUNED, PERIOD, seen, lift, with_load[ARM] - own[ARM] + noise)
+    assert payload.mass[0] == pytest.approx(mass, abs=0.03)
+    assert payload.mass[1] == 0.0  # the second robot was not observed
     for _ in range(300):
-        observer.update(hand, own[ARM], own[ARM])
-    assert observer.mass == pytest.approx(0.0, abs=0.15)  # the load was put down 6 s ago
+        payload.update(TUNED, PERIOD, seen, lift, np.zeros((2, 6)))
+    assert payload.mass[0] == pytest.approx(0.0, abs=0.15)  # the load was put down 6 s ago
 
 
 def test_an_arm_that_hangs_shows_no_payload():
-    observer = PayloadObserver(PERIOD, TUNED)
-    observer.update(np.zeros((6, 6)), np.zeros(6), np.full(6, 0.5))
-    assert observer.mass == 0.0
+    payload = Payload(np.zeros(1), np.zeros(1))
+    payload.update(TUNED, PERIOD, np.ones(1, dtype=bool), np.zeros((1, 6)), np.full((1, 6), 0.5))
+    assert payload.mass == 0.0
 
 
 def test_gains_are_found_in_noise_and_stay_nominal_where_nothing_shows_them():

@@ -1,4 +1,4 @@
-"""PlaCo and OSQP solve one and the same inverse-kinematics program."""
+"""DAQP, PlaCo and OSQP solve one and the same inverse-kinematics program."""
 
 import os
 from dataclasses import replace
@@ -10,23 +10,55 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from wbc_baselines.ik.batch_ik import OneByOne
+from wbc_baselines.ik.clearance import Clearance, Proximity
 from wbc_baselines.ik.config import Weights
+from wbc_baselines.ik.daqp_ik import DaqpIK
+from wbc_baselines.ik.geometry import Pose as Poses
+from wbc_baselines.ik.kinematics import Configuration, Kinematics
 from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
-from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
+from wbc_baselines.ik.osqp_ik import OsqpIK
 from wbc_baselines.ik.placo_ik import PlacoIK
-from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
+from wbc_baselines.ik.stance import Hull, Stance, base_from_stance, half_planes, measured_stance
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.robot import load_robot
-from wbc_bench.rotations import matrix_from_wxyz
+from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_xyzw
 
 PERIOD = 0.02  # [s]
 # damped enough for a full Gauss-Newton step to come to rest beside the singularities of wrist and knees
 WEIGHTS = Weights(regularization=1e-3)
 POSTURE = WEIGHTS.planning_posture
 ROBOT = load_robot()
-SOLVERS = {"placo": PlacoIK(ROBOT, WEIGHTS, PERIOD), "osqp": OsqpIK(ROBOT, WEIGHTS, PERIOD)}
 MODEL = WholeBodyModel(ROBOT)
+KINEMATICS = Kinematics(ROBOT)
+BATCHED = DaqpIK(ROBOT, WEIGHTS, PERIOD)
+
+
+class Single:
+    """The batched solver for one episode."""
+
+    def step(self, q, ee, soles, hull, posture, posture_weight, limit_speed=True) -> np.ndarray | None:
+        yaw = [np.arctan2(rot[1, 0], rot[0, 0]) for _, rot in soles]
+        found, solved = BATCHED.step(
+            Configuration(Poses(q[None, :3], matrix_from_wxyz(wxyz_from_xyzw(q[None, 3:7]))), q[None, 7:]),
+            Poses(ee[0][None], ee[1][None]),
+            Stance(np.array([[pos[:2] for pos, _ in soles]]), np.array([yaw])),
+            Hull.of(hull[None]),
+            posture[None],
+            np.array([posture_weight]),
+            np.array([limit_speed]),
+        )
+        if not solved[0]:
+            return None
+        return configuration(found.base.pos[0], found.base.rot[0], found.joints[0])
+
+
+SOLVERS = {
+    "placo": PlacoIK(ROBOT, WEIGHTS, PERIOD),
+    "osqp": OsqpIK(ROBOT, WEIGHTS, PERIOD),
+    "daqp": Single(),
+}
 
 
 class Standing(NamedTuple):
@@ -39,11 +71,12 @@ class Standing(NamedTuple):
 
 
 def _standing() -> Standing:
-    soles_b = MODEL.soles_in_base(ROBOT.default_q)
-    pos, rot = base_from_stance(soles_b, np.array([0.0, 0.0, 1.0]), None)
-    stance = measured_stance([(pos + rot @ p, rot @ r) for p, r in soles_b])
-    q = configuration(pos, rot, ROBOT.default_q)
-    return Standing(q, MODEL.ee_of(q), stance.poses(), stance.hull(MODEL.corners))
+    bodies = KINEMATICS.at(ROBOT.default_q[None])
+    base = base_from_stance(bodies, np.array([[0.0, 0.0, 1.0]]), None)
+    stance = measured_stance(base, bodies)
+    q = configuration(base.pos[0], base.rot[0], ROBOT.default_q)
+    soles = list(zip(stance.pos()[0], stance.rot()[0], strict=True))
+    return Standing(q, MODEL.ee_of(q), soles, stance.hull(MODEL.corners).corners(0))
 
 
 START = _standing()
@@ -82,21 +115,23 @@ def paths() -> list[dict[str, np.ndarray]]:
     return [_slew(target) for target in _targets(12)]
 
 
-def test_both_solvers_reach_the_same_poses(paths):
+@pytest.mark.parametrize(("name", "metres", "angle"), [("osqp", 1e-3, 2e-3), ("daqp", 1e-6, 1e-6)])
+def test_solvers_reach_the_same_poses(paths, name, metres, angle):
     for path in paths:
-        (pos_a, rot_a), (pos_b, rot_b) = (MODEL.ee_of(path[name][-1]) for name in SOLVERS)
-        assert np.linalg.norm(pos_a - pos_b) < 1e-3  # [m]
-        assert np.linalg.norm(pin.log3(rot_a.T @ rot_b)) < 2e-3  # [rad]
+        (pos_a, rot_a), (pos_b, rot_b) = (MODEL.ee_of(path[key][-1]) for key in ("placo", name))
+        assert np.linalg.norm(pos_a - pos_b) < metres
+        assert np.linalg.norm(pin.log3(rot_a.T @ rot_b)) < angle
 
 
-def test_both_solvers_take_the_same_steps(paths):
-    """OSQP from where PlaCo stands, so that differences do not add up along the way."""
+@pytest.mark.parametrize(("name", "tolerance"), [("osqp", 1e-5), ("daqp", 1e-9)])
+def test_solvers_take_the_same_steps(paths, name, tolerance):
+    """From where PlaCo stands, so that differences do not add up along the way."""
     for path, target in zip(paths, _targets(12), strict=True):
         for q in path["placo"][::14]:
             program = target, START.soles, START.hull, ROBOT.default_q, POSTURE, False
-            steps = [s.step(q, *program) for s in SOLVERS.values()]
-            # 1e-8, PlaCo's own damping on the base, is all that differs
-            np.testing.assert_allclose(steps[1], steps[0], atol=1e-5)
+            steps = [SOLVERS[key].step(q, *program) for key in ("placo", name)]
+            # OSQP's program lacks PlaCo's own damping, of 1e-8
+            np.testing.assert_allclose(steps[1], steps[0], atol=tolerance)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -251,7 +286,7 @@ def hugging() -> list[np.ndarray]:
     return paths
 
 
-def test_both_solvers_keep_arm_and_body_apart(hugging):
+def test_all_solvers_keep_arm_and_body_apart(hugging):
     clearance = Clearance(ROBOT, MODEL.model, WEIGHTS.collision_trigger)
     nearest = []
     for path, place in zip(hugging, HUGGING, strict=True):
@@ -261,10 +296,25 @@ def test_both_solvers_keep_arm_and_body_apart(hugging):
             nearest.append(min(clearance.rows(MODEL.data)[1], default=np.inf))
         for q in path[::6]:
             program = ee, START.soles, START.hull, ROBOT.default_q, POSTURE
-            steps = [s.step(q, *program) for s in SOLVERS.values()]
-            np.testing.assert_allclose(steps[1], steps[0], atol=1e-5)
+            steps = {name: solver.step(q, *program) for name, solver in SOLVERS.items()}
+            np.testing.assert_allclose(steps["osqp"], steps["placo"], atol=1e-5)
+            np.testing.assert_allclose(steps["daqp"], steps["placo"], atol=1e-9)
     assert np.mean(np.array(nearest) < WEIGHTS.collision_trigger) > 0.5  # else this tests nothing
     assert min(nearest) > 0.5 * WEIGHTS.collision_margin
+
+
+def test_distances_do_not_depend_on_what_was_measured_before(hugging):
+    clearance = Clearance(ROBOT, MODEL.model, np.inf)
+    joints = [q[7:] for path in hugging for q in path[::20]]
+
+    def measured(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        pin.computeJointJacobians(MODEL.model, MODEL.data, MODEL.at(q))
+        return clearance.rows(MODEL.data)
+
+    forth, back = [measured(q) for q in joints], [measured(q) for q in reversed(joints)]
+    for one, other in zip(forth, reversed(back), strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+        np.testing.assert_array_equal(one[1], other[1])
 
 
 def test_closing_rows_are_derivatives_of_their_distances(hugging):
@@ -287,6 +337,62 @@ def test_closing_rows_are_derivatives_of_their_distances(hugging):
             for d in h * np.eye(MODEL.model.nv)
         ]
         np.testing.assert_allclose(-closing.T, slope, atol=0.02)
+
+
+def test_no_pair_that_is_near_is_passed_over(hugging):
+    """The spheres say near at least where the shapes are."""
+    clearance = Clearance(ROBOT, MODEL.model, WEIGHTS.collision_trigger)
+    proximity = Proximity(KINEMATICS, clearance)
+    joints = np.concatenate([path[:, 7:] for path in hugging])
+    KINEMATICS.at(joints)
+    near, found = proximity.near(len(joints)), 0
+    for q, maybe in zip(joints, near, strict=True):
+        pin.computeJointJacobians(MODEL.model, MODEL.data, MODEL.at(q))
+        rows, distances = clearance.rows(MODEL.data)
+        fewer = clearance.rows(MODEL.data, np.flatnonzero(maybe))
+        np.testing.assert_array_equal(fewer[0], rows)
+        np.testing.assert_array_equal(fewer[1], distances)
+        found += len(distances)
+    assert found > 100 and near.sum() < 0.5 * near.size
+    # and of arms that are 20 cm away they say so of nothing
+    every = Clearance(ROBOT, MODEL.model, np.inf)
+    arms = np.tile(ROBOT.default_q, (200, 1))
+    arms[:, 8:] = np.random.default_rng(3).uniform(ROBOT.lower[8:], ROBOT.upper[8:], (200, 6))
+    KINEMATICS.at(arms)
+    near, away = proximity.near(len(arms)), 0
+    for q, maybe in zip(arms, near, strict=True):
+        pin.computeJointJacobians(MODEL.model, MODEL.data, MODEL.at(q))
+        if every.rows(MODEL.data)[1].min() > 0.2:
+            away += 1
+            assert not maybe.any()
+    assert away > 5
+
+
+def test_batched_steps_are_those_of_each_episode_alone(paths, hugging):
+    """Among others near and far, solvable and not, the very bits; and PlaCo one by one solves the same."""
+    rng = np.random.default_rng(2)
+    starts = np.concatenate([path["placo"][::10] for path in paths] + [path[::6] for path in hugging])
+    q = Configuration(Poses(starts[:, :3], matrix_from_wxyz(wxyz_from_xyzw(starts[:, 3:7]))), starts[:, 7:])
+    count = len(starts)
+    hand = Poses(START.ee[0] + rng.uniform(-0.2, 0.2, (count, 3)), np.tile(START.ee[1], (count, 1, 1)))
+    stance = Stance(np.tile([pos[:2] for pos, _ in START.soles], (count, 1, 1)), np.zeros((count, 2)))
+    stance.xy[::9, 1, 0] += 8.0  # nobody's leg is that long
+    hull = stance.hull(MODEL.corners)
+    part = q, hand, stance, hull
+    rest = np.tile(ROBOT.default_q, (count, 1)), np.full(count, 1e-2), rng.uniform(size=count) < 0.5
+    together, solved = BATCHED.step(*part, *rest)
+    assert not solved[::9].any() and solved[1::9].all()
+    for i in range(count):
+        row = np.array([i])
+        one = q.take(row), hand.take(row), stance.take(row), hull.take(row)
+        alone, found = BATCHED.step(*one, rest[0][row], rest[1][row], rest[2][row])
+        assert found[0] == solved[i]
+        for mine, all_of_them in ((alone.joints, together.joints), (alone.base.pos, together.base.pos)):
+            np.testing.assert_array_equal(mine[0], all_of_them[i])
+    other, found = OneByOne(SOLVERS["placo"]).step(*part, *rest)
+    np.testing.assert_array_equal(found, solved)
+    np.testing.assert_allclose(other.joints, together.joints, atol=1e-9)
+    np.testing.assert_allclose(other.base.rot, together.base.rot, atol=1e-8)
 
 
 def test_half_planes_of_a_square():

@@ -1,8 +1,8 @@
 """`ik`: whole-body inverse kinematics over the floating base.
 
-Variants: `ik` (PlaCo), `ik:osqp` (the same program on Pinocchio and OSQP), `ik:kinematic` (PlaCo without
-feed-forward and feedback: what is left is the whole-body IK alone) and
-`ik:standing` (PlaCo that never lifts a foot).
+Variants: `ik` (all episodes of a shard at once, their programs solved by DAQP), `ik:placo` and `ik:osqp` (the
+same program in PlaCo, and on Pinocchio and OSQP, an episode at a time), `ik:kinematic` (without feed-forward
+and feedback: what is left is the whole-body IK alone) and `ik:standing` (never lifts a foot).
 """
 
 from dataclasses import replace
@@ -19,12 +19,14 @@ CHANGES: dict[str, dict[str, bool]] = {  # to the tuned configuration
     "": {},
     "kinematic": {"feedforward": False, "feedback": False, "stepping": False},
     "osqp": {},
+    "placo": {},
     "standing": {"stepping": False},
 }
 DESCRIPTIONS = {
-    "": "Whole-body inverse kinematics that takes steps; its quadratic program is solved by PlaCo.",
+    "": "Whole-body inverse kinematics that takes steps; its quadratic program is solved by DAQP.",
     "kinematic": "The inverse kinematics alone: no feed-forward, no feedback, no steps.",
     "osqp": "The same quadratic program as `ik`, on Pinocchio and OSQP.",
+    "placo": "The same quadratic program as `ik`, in PlaCo.",
     "standing": "As `ik`, but no foot is ever lifted.",
 }
 VARIANTS = tuple(CHANGES)
@@ -46,15 +48,24 @@ class IK:
         name = f"ik:{variant}" if variant else "ik"
         # imported here: each solver is needed only by its own variant
         try:
+            from wbc_baselines.ik.batch_ik import OneByOne
             from wbc_baselines.ik.controller import PERIOD, IKController
 
             if variant == "osqp":
-                from wbc_baselines.ik.osqp_ik import OsqpIK as Solver
+                from wbc_baselines.ik.osqp_ik import OsqpIK
+
+                solver = OneByOne(OsqpIK(robot, config.weights, PERIOD))
+            elif variant == "placo":
+                from wbc_baselines.ik.placo_ik import PlacoIK
+
+                solver = OneByOne(PlacoIK(robot, config.weights, PERIOD))
             else:
-                from wbc_baselines.ik.placo_ik import PlacoIK as Solver
+                from wbc_baselines.ik.daqp_ik import DaqpIK
+
+                solver = DaqpIK(robot, config.weights, PERIOD)
         except ImportError as error:
             raise ControllerError(missing_extra(f"controller '{name}'", "ik", error)) from error
-        return IKController(robot, Solver(robot, config.weights, PERIOD), config, name)
+        return IKController(robot, solver, config, name)
 
     def variants(self) -> list[tuple[str, str]]:
         """Return every variant with its description."""

@@ -1,26 +1,38 @@
 """The arm's own servo: keeps the hand on its pose in the base frame while the body sways."""
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.model import Pose, WholeBodyModel
+from wbc_baselines.ik.geometry import Pose, log3, rotate, transposed
+from wbc_baselines.ik.kinematics import TCP, Bodies, Kinematics
 
 Array = NDArray[np.float64]
 
 
-def solve_arm(model: WholeBodyModel, joints: Array, pose_b: Pose, damping: float, limit: float) -> Array:
-    """Arm joints (6,) [rad] near those of `joints` (14,) that put the hand at a pose in the base frame.
+def solve_arm(
+    kinematics: Kinematics, joints: Array, bodies: Bodies, hand_b: Pose, damping: float, limit: float
+) -> Array:
+    """Arm joints (N, 6) [rad] near those of `joints` (N, 14) that put the hands at poses in the base frame.
 
-    Two damped Gauss-Newton steps; no joint moves further than `limit` [rad].
-    Source: Nakamura & Hanafusa 1986 (damped least squares).
+    Two damped Gauss-Newton steps, the first from the kinematics at these joints, `bodies`; no joint moves
+    further than `limit` [rad]. Source: Nakamura & Hanafusa 1986 (damped least squares).
     """
-    start = joints[8:]
     trial = joints.copy()
-    for _ in range(2):
-        (pos, rot), jacobian = model.arm_in_base(trial)
-        error = np.concatenate([pose_b[0] - pos, rot @ pin.log3(rot.T @ pose_b[1])])
-        gram = jacobian @ jacobian.T
-        gram[np.diag_indices(6)] += damping**2
-        trial[8:] += jacobian.T @ np.linalg.solve(gram, error)
-    return start + np.clip(trial[8:] - start, -limit, limit)
+    trial[:, 8:] += _arm_step(bodies, hand_b, damping)
+    trial[:, 8:] += _arm_step(kinematics.at(trial), hand_b, damping)
+    return joints[:, 8:] + np.clip(trial[:, 8:] - joints[:, 8:], -limit, limit)
+
+
+def _arm_step(bodies: Bodies, hand_b: Pose, damping: float) -> Array:
+    rot = bodies.rot[:, TCP]
+    turning = rotate(rot, log3(transposed(rot) @ hand_b.rot))
+    error = np.concatenate([hand_b.pos - bodies.pos[:, TCP], turning], axis=1)
+    jacobian = np.concatenate([bodies.linear[:, 8:], bodies.axis[:, 8:]], axis=2)  # (N, 6, 6) transposed
+    return damped_step(jacobian, error, damping**2)
+
+
+def damped_step(transposed_jacobian: Array, error: Array, damping: float) -> Array:
+    """Damped least squares J^T (J J^T + d)^-1 e, (N, K), of Jacobians J^T (N, K, M) and errors (N, M)."""
+    gram = transposed(transposed_jacobian) @ transposed_jacobian + damping * np.eye(error.shape[1])
+    multipliers = np.linalg.solve(gram, error[..., None])
+    return (transposed_jacobian @ multipliers)[..., 0]

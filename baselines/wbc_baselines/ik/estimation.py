@@ -1,10 +1,14 @@
 """State estimation from the deployable signals: joints, gravity, centre of mass. Batched over episodes."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from wbc_baselines.ik.model import GRAVITY
+from wbc_baselines.ik.geometry import cross, dot
+from wbc_baselines.ik.kinematics import GRAVITY
+from wbc_baselines.ik.rows import Rows
 
 Array = NDArray[np.float64]
 
@@ -66,7 +70,7 @@ class GravityFilter:
 
     def update(self, gravity: Array, ang_vel_b: Array) -> None:
         """Take in measured directions (N, 3) and gyro rates (N, 3) [rad/s]."""
-        pred = self.gravity - self._period * np.cross(ang_vel_b, self.gravity)
+        pred = self.gravity - self._period * cross(ang_vel_b, self.gravity)
         self._count += 1
         gain = max(self._gain, 1 / self._count)
         self.deviation = self._noise * np.sqrt(gain)
@@ -74,40 +78,53 @@ class GravityFilter:
         self.gravity = pred / np.linalg.norm(pred, axis=1, keepdims=True)
 
 
+@dataclass
+class Com(Rows):
+    """Position and velocity of the centres of mass of N robots, as a `ComFilter` knows them."""
+
+    pos: Array  # (N, 3) [m]
+    vel: Array  # (N, 3) [m/s]
+    cov: Array  # (N, 2, 2) of each axis [m^2], [m^2/s], [m^2/s^2]
+
+    def capture_point(self) -> tuple[Array, Array]:
+        """Where (N, 2) [m] a foot would bring the mass to rest, and the rate (N,) [1/s] of running away.
+
+        Source: Pratt et al. 2006.
+        """
+        rate = np.sqrt(GRAVITY / np.maximum(self.pos[:, 2], 0.2))  # [1/s] of the linear inverted pendulum
+        return self.pos[:, :2] + self.vel[:, :2] / rate[:, None], rate
+
+
 class ComFilter:
-    """Position and velocity of the centre of mass of one robot, a Kalman filter.
+    """A Kalman filter of the centre of mass.
 
     Between steps the mass follows the planned contact force. An innovation that the noise cannot explain is
     taken for a push and opens the filter to a jump of the velocity.
     """
 
-    def __init__(self, period: float, pos_noise: float, acceleration: float, jump: float, pos: Array) -> None:
+    def __init__(self, period: float, pos_noise: float, acceleration: float, jump: float) -> None:
         self._a = np.array([[1.0, period], [0.0, 1.0]])
         self._b = np.array([period**2 / 2, period])
         self._process = acceleration**2 * np.outer(self._b, self._b)
         self._joint_variance = pos_noise**2
         self._jump = jump**2 * np.outer([period, 1.0], [period, 1.0])
-        self.pos, self.vel = pos.copy(), np.zeros(3)  # (3,) [m], (3,) [m/s]
-        self._cov = np.diag([0.03**2, 0.2**2])  # [m^2], [m^2/s^2] at a disturbed reset
 
-    def update(self, pos: Array, acceleration: Array, tilt: float) -> None:
-        """Take in a position (3,) [m], seen with a tilt error [rad], after an acceleration (3,) [m/s^2]."""
+    def start(self, pos: Array) -> Com:
+        """At rest at (N, 3) [m]."""
+        cov = np.diag([0.03**2, 0.2**2])  # [m^2], [m^2/s^2] at a disturbed reset
+        return Com(pos.copy(), np.zeros_like(pos), np.tile(cov, (len(pos), 1, 1)))
+
+    def update(self, com: Com, pos: Array, acceleration: Array, tilt: float) -> None:
+        """Take in positions (N, 3) [m], seen with a tilt error [rad], after accelerations (N, 3) [m/s^2]."""
         a, b = self._a, self._b
-        pred = self.pos + a[0, 1] * self.vel + b[0] * acceleration
-        vel = self.vel + b[1] * acceleration
-        cov = a @ self._cov @ a.T + self._process
-        noise = self._joint_variance + (tilt * pos[2]) ** 2
+        pred = com.pos + a[0, 1] * com.vel + b[0] * acceleration
+        vel = com.vel + b[1] * acceleration
+        cov = a @ com.cov @ a.T + self._process
+        noise = self._joint_variance + (tilt * pos[:, 2]) ** 2  # (N,)
         innovation = pos - pred
-        if innovation @ innovation > 3.0**2 * 3 * (cov[0, 0] + noise):  # three sigma, three axes
-            cov = cov + self._jump
-        gain = cov[:, 0] / (cov[0, 0] + noise)
-        self.pos, self.vel = pred + gain[0] * innovation, vel + gain[1] * innovation
-        self._cov = cov - gain[:, None] * cov[0]
-
-    def capture_point(self) -> tuple[Array, float]:
-        """Where (2,) [m] a foot would bring the mass to rest, and the rate [1/s] at which that runs away.
-
-        Source: Pratt et al. 2006.
-        """
-        rate = float(np.sqrt(GRAVITY / max(self.pos[2], 0.2)))  # [1/s] of the linear inverted pendulum
-        return self.pos[:2] + self.vel[:2] / rate, rate
+        # three sigma, three axes
+        pushed = dot(innovation, innovation) > 3.0**2 * 3 * (cov[:, 0, 0] + noise)
+        cov = cov + np.where(pushed[:, None, None], self._jump, 0.0)
+        gain = cov[:, :, 0] / (cov[:, 0, 0] + noise)[:, None]  # (N, 2)
+        com.pos, com.vel = pred + gain[:, :1] * innovation, vel + gain[:, 1:] * innovation
+        com.cov = cov - gain[:, :, None] * cov[:, :1]

@@ -1,42 +1,46 @@
 """What measured torques say of the robot: the payload in its hand, and the gains of its drives."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from wbc_baselines.ik.config import IKConfig
-from wbc_baselines.ik.model import GRAVITY
+from wbc_baselines.ik.kinematics import GRAVITY
+from wbc_baselines.ik.rows import Mask, Rows
 
 Array = NDArray[np.float64]
 LEAST = 1.0  # [(N m/kg)^2] of the arm's torques per kilogram, below which a payload cannot be seen; choice
 SATURATED = 0.8  # of a torque limit, from which on a drive says nothing of its gain; choice
 
 
-class PayloadObserver:
-    """Payload in the hand of one robot: what the arm's torques hold beyond the arm's own weight.
+@dataclass
+class Payload(Rows):
+    """Payload in the hands of N robots: what the arm's torques hold beyond the arm's own weight.
 
     A mean at first, then a low-pass filter, whose noise would otherwise shake the soft arm that its result
     is fed forward to.
     """
 
-    def __init__(self, period: float, s: IKConfig) -> None:
-        self._period, self._filter_time, self._limit = period, s.payload_time, s.payload_limit
-        self._time = 0.0  # [s] of observation
-        self.mass = 0.0  # [kg]
+    time: Array  # (N,) [s] of observation
+    mass: Array  # (N,) [kg]
 
-    def update(self, hand: Array, gravity: Array, torque: Array) -> None:
+    def update(self, s: IKConfig, period: float, seen: Mask, lift: Array, residual: Array) -> None:
         """Take in arm torques.
 
         Args:
-            hand: Jacobian (6, 6) of the end-effector by the arm's joints, world-aligned.
-            gravity: (6,) [N m] that the arm's own weight asks for.
-            torque: (6,) [N m] measured.
+            s: Filter time and limit.
+            period: [s] since the last one.
+            seen: (N,) robots that are observed.
+            lift: (N, 6) [m/rad] of the end-effector, upwards, by the arm's joints.
+            residual: (N, 6) [N m] measured beyond what the arm's own weight asks for.
         """
-        self._time += self._period
-        per_kg = hand[2] * GRAVITY  # (6,) [N m/kg]
-        residual = torque - gravity - self.mass * per_kg
-        gain = self._period / min(self._time, self._filter_time)
-        step = gain * float(per_kg @ residual) / float(per_kg @ per_kg + LEAST)
-        self.mass = float(np.clip(self.mass + step, 0.0, self._limit))
+        self.time += np.where(seen, period, 0.0)
+        per_kg = lift * GRAVITY  # (N, 6) [N m/kg]
+        gain = np.where(seen, period / np.clip(self.time, period, s.payload_time), 0.0)
+        left = residual - self.mass[:, None] * per_kg
+        step = gain * (per_kg * left).sum(axis=1) / ((per_kg * per_kg).sum(axis=1) + LEAST)
+        self.mass = np.clip(self.mass + step, 0.0, s.payload_limit)
 
 
 class GainObserver:

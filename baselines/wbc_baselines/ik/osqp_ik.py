@@ -11,8 +11,9 @@ import qpsolvers
 from numpy.typing import NDArray
 from scipy import sparse
 
+from wbc_baselines.ik.clearance import Clearance
 from wbc_baselines.ik.config import Weights
-from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel
+from wbc_baselines.ik.model import Pose, WholeBodyModel
 from wbc_baselines.ik.stance import half_planes
 from wbc_bench.robot import NUM_JOINTS, Robot
 
@@ -160,45 +161,6 @@ class OsqpIK:
         """Turn a frame to a rotation (3, 3); the error is the rotation vector [rad] in world axes."""
         rot = self._model.data.oMf[frame].rotation
         return Row(self._model.jacobian(frame)[3:], pin.log3(target @ rot.T))
-
-
-class Clearance:
-    """Distances between the parts of the robot that can meet: those that `placo_ik` keeps apart."""
-
-    def __init__(self, robot: Robot, model: pin.Model, trigger: float) -> None:
-        self._model, self._trigger = model, trigger
-        self._geometry = geometry = pin.buildGeomFromUrdfString(model, robot.urdf(), pin.COLLISION)
-        links = [model.frames[part.parentFrame].name for part in geometry.geometryObjects]
-        self._joints = [part.parentJoint for part in geometry.geometryObjects]
-        arms = [i for i, link in enumerate(links) if link in ARM_LINKS]
-        bodies = [i for i, link in enumerate(links) if link in BODY_LINKS]
-        self._pairs = [(arm, body) for arm in arms for body in bodies]
-        for pair in self._pairs:
-            geometry.addCollisionPair(pin.CollisionPair(*pair))
-        self._data = pin.GeometryData(geometry)
-
-    def rows(self, data: pin.Data) -> tuple[Array, Array]:
-        """Of each pair nearer than the trigger: how fast it closes (S, 20), and its distance (S,) [m].
-
-        data: after `computeJointJacobians`.
-        """
-        model = self._model
-        pin.updateGeometryPlacements(model, data, self._geometry, self._data)
-        pin.computeDistances(self._geometry, self._data)
-        rows, distances = [], []
-        for pair, result in zip(self._pairs, self._data.distanceResults, strict=True):
-            if result.min_distance < self._trigger:
-                normal = result.normal  # from the first to the second, through both nearest points
-                row = np.zeros(model.nv)
-                for sign, i, point in (
-                    (1, pair[0], result.getNearestPoint1()),
-                    (-1, pair[1], result.getNearestPoint2()),
-                ):
-                    jacobian = pin.getJointJacobian(model, data, self._joints[i], pin.WORLD)
-                    row += sign * np.concatenate([normal, np.cross(point, normal)]) @ jacobian
-                rows.append(row)
-                distances.append(result.min_distance)
-        return np.array(rows).reshape(-1, model.nv), np.array(distances)
 
 
 def solve(program: Program) -> Array | None:

@@ -1,11 +1,17 @@
 """The way of the hand: from where it is to the target, slowly and smoothly, towards a planned posture."""
 
+from dataclasses import dataclass
+
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
+from wbc_baselines.ik.batch_ik import BatchIK
 from wbc_baselines.ik.config import IKConfig
-from wbc_baselines.ik.model import Pose, WholeBodyModel, turn
+from wbc_baselines.ik.geometry import Pose, log3, norm, transposed, turn
+from wbc_baselines.ik.kinematics import Configuration, Kinematics
+from wbc_baselines.ik.rows import Mask, Rows
+from wbc_baselines.ik.stance import Hull, Stance
+from wbc_bench.rotations import matrix_from_rotvec
 
 Array = NDArray[np.float64]
 # hip, knee, J1, J2, J3 [rad]: squatting, upright, leaning, crouching, arm to either side
@@ -19,82 +25,124 @@ SEEDS = (
 )
 
 MAX_LEAN = 1.0  # [rad]
+ARRIVED = 0.01  # [m + 0.3 m/rad]
+STEPS, SLEW = 60, 35  # of a plan, and of them until the target has arrived
 
 
-class Reference:
-    """Slewed target of one episode in the anchor frame, and the joint posture that goes with it."""
+@dataclass
+class Reference(Rows):
+    """Slewed targets of N episodes in the anchor frame, and the joint postures that go with them."""
 
-    def __init__(self, config: IKConfig, period: float, ee: Pose, target: Pose, posture: Array) -> None:
-        self._s, self._period = config, period
-        self.ee = ee  # where the hand should be now
-        self.target = target  # filtered
-        self.posture = posture  # (14,) [rad] preferred now
-        self.goal: Array | None = None  # (14,) [rad] planned at the target
-        self._start = posture
-        self._speed = 0.0  # fraction of the limit
-        self._way, self.left = 0.0, np.inf  # [s] at full speed: the longest seen, and what is left
+    hand: Pose  # where the hands should be now
+    target: Pose  # filtered
+    posture: Array  # (N, 14) [rad] preferred now
+    start: Array  # (N, 14) [rad] where the posture began
+    goal: Array  # (N, 14) [rad] planned at the target
+    planned: Mask  # (N,) whether there is a goal
+    speed: Array  # (N,) fraction of the limit
+    way: Array  # (N,) [s] at full speed: the longest that was left,
+    left: Array  # (N,) [s] and what is left
 
-    def track(self, target: Pose) -> None:
-        """Take in a measured target."""
-        part = self._period / self._s.target_filter
-        self.target = (
-            self.target[0] + part * (target[0] - self.target[0]),
-            turn(self.target[1], target[1], part),
-        )
+    @classmethod
+    def begin(cls, hand: Pose, target: Pose, posture: Array) -> "Reference":
+        """At rest, with the way still to be planned."""
+        zero = np.zeros(len(posture))
+        left = np.full(len(posture), np.inf)
+        no_goal, none = np.zeros_like(posture), np.zeros(len(posture), dtype=bool)
+        return cls(hand, target, posture.copy(), posture.copy(), no_goal, none, zero, zero.copy(), left)
+
+    def track(self, s: IKConfig, period: float, target: Pose) -> None:
+        """Take in measured targets."""
+        part = period / s.target_filter
+        pos = self.target.pos + part * (target.pos - self.target.pos)
+        self.target = Pose(pos, turn(self.target.rot, target.rot, part))
 
     def set_goal(self, start: Array, goal: Array) -> None:
-        """The posture (14,) moves from one configuration to another as the hand goes its way."""
-        self._start, self.goal = start, goal
+        """The postures (N, 14) move from one configuration to another as the hands go their way."""
+        self.start, self.goal, self.planned = start, goal, np.ones(len(goal), dtype=bool)
 
-    def advance(self) -> None:
+    def advance(self, s: IKConfig, period: float) -> None:
         """One step of the way."""
-        s = self._s
-        way, turning = self.target[0] - self.ee[0], pin.log3(self.ee[1].T @ self.target[1])
-        self.left = max(norm(way) / s.slew_linear, norm(turning) / s.slew_angular)
-        self._way = max(self._way, self.left)
-        self._speed = min(1.0, self._speed + self._period / s.slew_ramp, s.slew_gain * self.left)
-        part = min(1.0, self._speed * self._period / max(self.left, 1e-9))
-        self.ee = (self.ee[0] + part * way, self.ee[1] @ pin.exp3(part * turning))
-        if self.goal is not None:
-            self.posture = self.goal + (self.left / max(self._way, 1e-9)) * (self._start - self.goal)
+        way = self.target.pos - self.hand.pos
+        turning = log3(transposed(self.hand.rot) @ self.target.rot)
+        self.left = np.maximum(norm(way) / s.slew_linear, norm(turning) / s.slew_angular)
+        self.way = np.maximum(self.way, self.left)
+        ramp = np.minimum(1.0, self.speed + period / s.slew_ramp)
+        self.speed = np.minimum(ramp, s.slew_gain * self.left)
+        part = np.minimum(1.0, self.speed * period / np.maximum(self.left, 1e-9))[:, None]
+        rot = self.hand.rot @ matrix_from_rotvec(part * turning)
+        self.hand = Pose(self.hand.pos + part * way, rot)
+        ahead = (self.left / np.maximum(self.way, 1e-9))[:, None]
+        posture = self.goal + ahead * (self.start - self.goal)
+        self.posture = np.where(self.planned[:, None], posture, self.posture)
 
 
 def plan_goal_posture(
-    solver,
-    model: WholeBodyModel,
-    q: Array,
-    ee: Pose,
+    solver: BatchIK,
+    kinematics: Kinematics,
+    start: Configuration,
+    hand: Pose,
     target: Pose,
-    soles: list[Pose],
-    hull: Array,
+    stance: Stance,
+    hull: Hull,
     default: Array,
     weight: float,
-) -> tuple[Array, float]:
-    """Joint positions (14,) at the target, and the error [m + 0.3 m/rad] left there.
+) -> tuple[Array, Array]:
+    """Joint positions (N, 14) at targets, and the errors (N,) [m + 0.3 m/rad] left there.
 
     Differential IK falls into local minima: it is run from several preferred postures, and the first that
-    arrives within 1 cm, or the best, is taken.
+    arrives within 1 cm, or the best, is taken. How many of them are run at once does not change the result.
     """
-    best, best_error = q, np.inf
-    turning = pin.log3(ee[1].T @ target[1])
-    for seed in seeds(default):
-        trial = q
-        for k in range(60):
-            part = min(1.0, (k + 1) / 35)
-            pose = (ee[0] + part * (target[0] - ee[0]), ee[1] @ pin.exp3(part * turning))
-            step = solver.step(trial, pose, soles, hull, seed, weight, limit_speed=False)
-            if step is None:
-                break
-            trial = step
-        pos, rot = model.ee_of(trial)
-        error = norm(pos - target[0]) + 0.3 * norm(pin.log3(rot.T @ target[1]))
-        # a base that leans this far is about to be counted as fallen
-        error += max(0.0, float(np.arccos(np.clip(upright(trial), -1.0, 1.0))) - MAX_LEAN)
-        if error < best_error:
-            best, best_error = trial, error
-        if error < 0.01:
+    postures = np.array(seeds(default))
+    best, best_error = start.joints.copy(), np.full(len(start.joints), np.inf)
+    open_rows, first = np.arange(len(best)), 0
+    while len(open_rows) and first < len(postures):
+        chosen = postures[first : first + max(1, solver.lanes // len(open_rows))]
+        first += len(chosen)
+        rows = np.repeat(open_rows, len(chosen))
+        wanted = np.tile(chosen, (len(open_rows), 1))
+        part = start.take(rows), hand.take(rows), target.take(rows), stance.take(rows), hull.take(rows)
+        joints, error = _walk(solver, kinematics, *part, wanted, weight)
+        joints, error = joints.reshape(*(shape := (len(open_rows), len(chosen))), -1), error.reshape(shape)
+        arrived = error < ARRIVED
+        pick = np.where(arrived.any(axis=1), arrived.argmax(axis=1), error.argmin(axis=1))
+        each = np.arange(len(open_rows))
+        joints, error = joints[each, pick], error[each, pick]
+        better = error < best_error[open_rows]
+        best[open_rows[better]], best_error[open_rows[better]] = joints[better], error[better]
+        open_rows = open_rows[best_error[open_rows] >= ARRIVED]
+    return best, best_error
+
+
+def _walk(
+    solver: BatchIK,
+    kinematics: Kinematics,
+    q: Configuration,
+    hand: Pose,
+    target: Pose,
+    stance: Stance,
+    hull: Hull,
+    posture: Array,
+    weight: float,
+) -> tuple[Array, Array]:
+    """Joint positions (N, 14) after 60 steps towards a preferred posture each, and the errors (N,) there."""
+    turning = log3(transposed(hand.rot) @ target.rot)
+    weights, free = np.full(len(posture), weight), np.zeros(len(posture), dtype=bool)
+    going = ~free
+    for k in range(STEPS):
+        part = min(1.0, (k + 1) / SLEW)
+        rot = hand.rot @ matrix_from_rotvec(part * turning)
+        pose = Pose(hand.pos + part * (target.pos - hand.pos), rot)
+        step, found = solver.step(q, pose, stance, hull, posture, weights, free)
+        going &= found
+        if not going.any():
             break
-    return best[7:], best_error
+        q.put(going, step.take(going))
+    reached = q.hand(kinematics.at(q.joints))
+    error = norm(reached.pos - target.pos) + 0.3 * norm(log3(transposed(reached.rot) @ target.rot))
+    # a base that leans this far is about to be counted as fallen
+    lean = np.arccos(np.clip(q.base.rot[:, 2, 2], -1.0, 1.0))
+    return q.joints, error + np.maximum(0.0, lean - MAX_LEAN)
 
 
 def seeds(default: Array) -> list[Array]:
@@ -107,14 +155,3 @@ def seeds(default: Array) -> list[Array]:
         q[8:11] = j1, j2, j3
         postures.append(q)
     return postures
-
-
-def upright(q: Array) -> float:
-    """Cosine of the angle between the base's and the world's vertical at a configuration (21,)."""
-    x, y = q[3], q[4]
-    return 1.0 - 2.0 * (x * x + y * y)
-
-
-def norm(vector: Array) -> float:
-    """Euclidean length."""
-    return float(np.sqrt(vector @ vector))

@@ -1,67 +1,36 @@
-"""Solve time of one step of whole-body IK: PlaCo and OSQP beside Pink and mink, on one and the same problem.
+"""Solve time of one step of whole-body IK: DAQP, PlaCo and OSQP beside Pink and mink, on the same problem.
 
-Pink and mink ship neither a support polygon nor a foot constraint without roll and yaw; both are added here
-through their public interfaces, as a limit and a task. What keeps arm and body apart is soft in `placo_ik`
-and hard in these two, whose limits have no slack; otherwise all solve the same program. It is the one of
-planning, whose posture hardly pulls at the hand.
+It is the program of planning, whose posture hardly pulls at the hand. DAQP solves all targets at once, as the
+controller does the episodes of a shard: its times are those of a call by its number of programs.
 """
 
 import time
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 import pinocchio as pin
-import qpsolvers
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.config import TUNED, Weights
-from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel, configuration
-from wbc_baselines.ik.osqp_ik import Clearance, OsqpIK
+from wbc_baselines.ik.config import TUNED
+from wbc_baselines.ik.daqp_ik import DaqpIK
+from wbc_baselines.ik.geometry import Pose as Poses
+from wbc_baselines.ik.kinematics import Configuration, Kinematics
+from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
+from wbc_baselines.ik.osqp_ik import OsqpIK
+from wbc_baselines.ik.peers import PERIOD, BenchProblem, Solver, make_mink, make_pink
 from wbc_baselines.ik.placo_ik import PlacoIK
-from wbc_baselines.ik.stance import base_from_stance, half_planes, measured_stance
+from wbc_baselines.ik.reference import SLEW
+from wbc_baselines.ik.stance import Hull, Stance, base_from_stance, measured_stance
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.errors import missing_extra
-from wbc_bench.robot import JOINT_NAMES, Robot, load_robot
-from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
+from wbc_bench.robot import load_robot
+from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_xyzw
 
 Array = NDArray[np.float64]
-PERIOD = 0.02  # [s]
-SLEW = 35  # steps until the target has arrived, as in `reference.plan_goal_posture`
-POSITION_AND_PITCH = [0, 1, 2, 4]  # of a foot's twist in its own frame
-QP_SOLVERS = ("daqp", "quadprog", "proxqp", "osqp")  # for Pink and mink: the fastest here first
-
-
-class BenchProblem(NamedTuple):
-    """What stays the same in all steps: the robot stands in its default posture on flat ground."""
-
-    robot: Robot
-    weights: Weights
-    q: Array  # (21,) to start from, in Pinocchio's order
-    soles: list[Pose]
-    hull: Array  # (V, 2) [m]
-
-
-class Solver(Protocol):
-    """A package under test; its configurations q are in its own order."""
-
-    package: str
-    qp: str
-
-    def start(self, q: Array) -> Array:
-        """Its configuration of Pinocchio's."""
-        ...
-
-    def step(self, q: Array, ee: Pose) -> Array | None:
-        """One step, all of which is timed: kinematics at q, targets, program, solution, integration."""
-        ...
-
-    def to_pinocchio(self, q: Array) -> Array:
-        """The inverse of `start`."""
-        ...
 
 
 class Ours:
@@ -90,196 +59,25 @@ def make_osqp(problem: BenchProblem) -> Solver:
     return Ours(OsqpIK(problem.robot, problem.weights, PERIOD), "osqp", "osqp", problem)
 
 
-def make_pink(problem: BenchProblem) -> Solver:
-    """Raises: ImportError: Pink is not installed."""
-    import pink  # pyright: ignore[reportMissingImports]
-    from pink.limits import ConfigurationLimit, Limit, VelocityLimit  # pyright: ignore[reportMissingImports]
-    from pink.tasks import ComTask, FrameTask, PostureTask  # pyright: ignore[reportMissingImports]
-
-    robot, weights = problem.robot, problem.weights
-    model = WholeBodyModel(robot).model
-    model.lowerPositionLimit[7:] = robot.lower + weights.joint_margin
-    model.upperPositionLimit[7:] = robot.upper - weights.joint_margin
-    model.velocityLimit[:6] = np.inf
-    model.velocityLimit[6:] = weights.speed_fraction * robot.velocity
-    normal, offset = half_planes(problem.hull)
-    clearance = Clearance(robot, model, weights.collision_trigger)
-
-    class PositionPitchTask(FrameTask):
-        def compute_error(self, configuration):
-            return super().compute_error(configuration)[POSITION_AND_PITCH]
-
-        def compute_jacobian(self, configuration):
-            return super().compute_jacobian(configuration)[POSITION_AND_PITCH]
-
-    class PolygonLimit(Limit):
-        def compute_qp_inequalities(self, configuration, dt):
-            jacobian = pin.jacobianCenterOfMass(configuration.model, configuration.data)[:2]
-            room = offset - weights.com_margin - normal @ configuration.data.com[0][:2]
-            return normal @ jacobian, room
-
-    class ClearanceLimit(Limit):
-        def compute_qp_inequalities(self, configuration, dt):
-            closing, distance = clearance.rows(configuration.data)
-            return (closing, distance - weights.collision_margin) if len(distance) else None
-
-    class Pink:
-        package, qp = "pin-pink", _qp_solver()
-
-        def __init__(self) -> None:
-            self._configuration = pink.Configuration(model, model.createData(), problem.q)
-            self._ee = FrameTask("tcp", np.sqrt(weights.ee_position), np.sqrt(weights.ee_orientation))
-            left, right = FrameTask("sole_L", 1.0, 1.0), PositionPitchTask("sole_R", 1.0, 1.0)
-            flat = FrameTask("sole_R", 0.0, np.sqrt(weights.foot_flat))
-            upright = FrameTask("base_Link", 0.0, np.sqrt(weights.upright))
-            upright.set_target(pin.SE3.Identity())
-            com = ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
-            posture = PostureTask(float(np.sqrt(weights.planning_posture)))
-            for task, (pos, rot) in zip((left, right, flat), [*problem.soles, problem.soles[1]], strict=True):
-                task.set_target(pin.SE3(rot, pos))
-            com.set_target(np.array([*problem.hull.mean(axis=0), 0.0]))
-            posture.set_target(problem.q)
-            self._tasks, self._hard = [self._ee, flat, upright, com, posture], [left, right]
-            self._limits = [
-                ConfigurationLimit(model, 1.0),
-                VelocityLimit(model),
-                PolygonLimit(),
-                ClearanceLimit(),
-            ]
-
-        def start(self, q: Array) -> Array:
-            return q
-
-        to_pinocchio = start
-
-        def step(self, q: Array, ee: Pose) -> Array | None:
-            self._configuration.update(q)
-            self._ee.set_target(pin.SE3(ee[1], ee[0]))
-            try:
-                velocity = pink.solve_ik(
-                    self._configuration,
-                    self._tasks,
-                    PERIOD,
-                    self.qp,
-                    damping=weights.regularization,
-                    limits=self._limits,
-                    constraints=self._hard,
-                    safety_break=False,
-                )
-            except pink.exceptions.NoSolutionFound:
-                return None
-            return self._configuration.integrate(velocity, PERIOD)
-
-    return Pink()
-
-
-def make_mink(problem: BenchProblem) -> Solver:
-    """Raises: ImportError: mink is not installed."""
-    import mink  # pyright: ignore[reportMissingImports]
-    import mujoco
-
-    robot, weights = problem.robot, problem.weights
-    model = robot.model()
-    normal, offset = half_planes(problem.hull)
-
-    class PositionPitchTask(mink.FrameTask):
-        def compute_error(self, configuration):
-            return super().compute_error(configuration)[POSITION_AND_PITCH]
-
-        def compute_jacobian(self, configuration):
-            return super().compute_jacobian(configuration)[POSITION_AND_PITCH]
-
-    class PolygonLimit(mink.Limit):
-        def compute_qp_inequalities(self, configuration, dt):
-            jacobian = np.empty((3, model.nv))
-            mujoco.mj_jacSubtreeCom(model, configuration.data, jacobian, 1)
-            room = offset - weights.com_margin - normal @ configuration.data.subtree_com[1][:2]
-            return mink.Constraint(normal @ jacobian[:2], room)
-
-    class Mink:
-        package, qp = "mink", _qp_solver()
-
-        def __init__(self) -> None:
-            self._configuration = mink.Configuration(model)
-            costs = np.sqrt(weights.ee_position), np.sqrt(weights.ee_orientation)
-            self._ee = mink.FrameTask("tcp", "site", *costs)
-            left = mink.FrameTask("sole_L", "site", 1.0, 1.0)
-            right = PositionPitchTask("sole_R", "site", 1.0, 1.0)
-            flat = mink.FrameTask("sole_R", "site", 0.0, np.sqrt(weights.foot_flat))
-            upright = mink.FrameTask("base_Link", "body", 0.0, np.sqrt(weights.upright))
-            upright.set_target(mink.SE3.identity())
-            com = mink.ComTask(np.sqrt(weights.com) * np.array([1.0, 1.0, 0.0]))
-            posture = mink.PostureTask(model, float(np.sqrt(weights.planning_posture)))
-            for task, pose in zip((left, right, flat), [*problem.soles, problem.soles[1]], strict=True):
-                task.set_target(_se3(pose))
-            com.set_target(np.array([*problem.hull.mean(axis=0), 0.0]))
-            posture.set_target(self.start(problem.q))
-            self._tasks, self._hard = [self._ee, flat, upright, com, posture], [left, right]
-            speed = weights.speed_fraction * robot.velocity
-            self._limits = [
-                mink.ConfigurationLimit(model, 1.0, weights.joint_margin),
-                mink.VelocityLimit(model, dict(zip(JOINT_NAMES, speed, strict=True))),
-                PolygonLimit(),
-                mink.CollisionAvoidanceLimit(
-                    model,
-                    [(_geoms(ARM_LINKS), _geoms(BODY_LINKS))],
-                    gain=1.0,
-                    minimum_distance_from_collisions=weights.collision_margin,
-                    collision_detection_distance=weights.collision_trigger,
-                ),
-            ]
-
-        def start(self, q: Array) -> Array:
-            return np.concatenate([q[:3], q[[6, 3, 4, 5]], q[7:]])
-
-        def to_pinocchio(self, q: Array) -> Array:
-            return np.concatenate([q[:3], q[[4, 5, 6, 3]], q[7:]])
-
-        def step(self, q: Array, ee: Pose) -> Array | None:
-            self._configuration.update(q)
-            self._ee.set_target(_se3(ee))
-            try:
-                velocity = mink.solve_ik(
-                    self._configuration,
-                    self._tasks,
-                    PERIOD,
-                    self.qp,
-                    damping=weights.regularization,
-                    limits=self._limits,
-                    constraints=self._hard,
-                )
-            except mink.NoSolutionFound:
-                return None
-            return self._configuration.integrate(velocity, PERIOD)
-
-    def _geoms(bodies: tuple[str, ...]) -> list[int]:
-        ids = [model.body(body).id for body in bodies]
-        return np.flatnonzero(np.isin(model.geom_bodyid, ids)).tolist()
-
-    def _se3(pose: Pose):
-        return mink.SE3(np.concatenate([wxyz_from_matrix(pose[1]), pose[0]]))
-
-    return Mink()
-
-
 MAKERS: dict[str, Callable[[BenchProblem], Solver]] = {
     "placo": make_placo,
     "osqp": make_osqp,
     "pin-pink": make_pink,
     "mink": make_mink,
 }
+BATCHED = "daqp"
 
 
 class Walk(NamedTuple):
     """One package on the way to one target."""
 
-    times: list[float]  # [ms] of each step
+    times: list[float]  # [ms] of processor time of each step
     failed: int  # steps without a solution
     error: tuple[float, float, float]  # at the end: hand [m], hand [rad], worse sole [m]
 
 
 def solve_times(targets: int, steps: int) -> pd.DataFrame:
-    """One row a package: times of a step in this process and thread, and the errors left at the end.
+    """One row a package: processor times of a step in this process, and the errors left at the end.
 
     Every package walks from the default posture to the same arm and posture targets of a tuning manifest,
     which arrive after `SLEW` of the steps; the packages take turns at every target, so that a load that comes
@@ -295,13 +93,18 @@ def solve_times(targets: int, steps: int) -> pd.DataFrame:
             rows[name] = {"package": name, "note": missing_extra("this row", "bench", error)}
     goals = _goals(problem, targets)
     walks = {name: [] for name in solvers}
+    together: list[Walk] = []
     for goal in [goals[0], *goals]:
         for name, solver in solvers.items():
             walks[name].append(_walk(problem, solver, goal, steps))
-    rows |= {name: _row(name, solvers[name].qp, walks[name][1:]) for name in solvers}  # the first warmed up
-    for name in solvers:
-        rows[name]["times placo"] = rows[name]["median [ms]"] / rows["placo"]["median [ms]"]
-    return pd.DataFrame([rows[name] for name in MAKERS])
+        together += _walk_together(problem, goals, steps)
+    # the first warmed up
+    walks[BATCHED] = together[len(goals) :]
+    rows[BATCHED] = _row(BATCHED, f"daqp, {len(goals)} at once", walks[BATCHED])
+    rows |= {name: _row(name, solvers[name].qp, walks[name][1:]) for name in solvers}
+    for name in (BATCHED, *solvers):
+        rows[name]["times daqp"] = rows[name]["median [ms]"] / rows[BATCHED]["median [ms]"]
+    return pd.DataFrame([rows[name] for name in (BATCHED, *MAKERS)])
 
 
 def _walk(problem: BenchProblem, solver: Solver, goal: Pose, steps: int) -> Walk:
@@ -312,14 +115,45 @@ def _walk(problem: BenchProblem, solver: Solver, goal: Pose, steps: int) -> Walk
     for k in range(steps):
         part = min(1.0, (k + 1) / SLEW)
         ee = start[0] + part * (goal[0] - start[0]), start[1] @ pin.exp3(part * turning)
-        begin = time.perf_counter()
+        begin = time.process_time()
         found = solver.step(q, ee)
-        times.append(1e3 * (time.perf_counter() - begin))
+        times.append(1e3 * (time.process_time() - begin))
         if found is None:
             failed += 1
         else:
             q = found
     return Walk(times, failed, _errors(model, solver.to_pinocchio(q), goal, problem.soles))
+
+
+def _walk_together(problem: BenchProblem, goals: list[Pose], steps: int) -> list[Walk]:
+    """The same ways with the batched solver, which is at all targets in each step."""
+    model, count = WholeBodyModel(problem.robot), len(goals)
+    solver = DaqpIK(problem.robot, problem.weights, PERIOD)
+    start = model.ee_of(problem.q)
+    pos, rot = np.array([goal[0] for goal in goals]), np.array([goal[1] for goal in goals])
+    turning = np.array([pin.log3(start[1].T @ turned) for turned in rot])
+    q = np.tile(problem.q, (count, 1))
+    at = Configuration(Poses(q[:, :3], matrix_from_wxyz(wxyz_from_xyzw(q[:, 3:7]))), q[:, 7:])
+    soles = np.tile([place[:2] for place, _ in problem.soles], (count, 1, 1))
+    stance = Stance(soles, np.zeros((count, 2)))  # the default posture stands straight
+    hull = Hull.of(np.tile(problem.hull, (count, 1, 1)))
+    posture = np.tile(problem.robot.default_q, (count, 1))
+    weight, limit = np.full(count, problem.weights.planning_posture), np.ones(count, dtype=bool)
+    times, failed = [], np.zeros(count, dtype=np.int64)
+    for k in range(steps):
+        part = min(1.0, (k + 1) / SLEW)
+        turned = np.array([start[1] @ pin.exp3(part * way) for way in turning])
+        hand = Poses(start[0] + part * (pos - start[0]), turned)
+        begin = time.process_time()
+        step, found = solver.step(at, hand, stance, hull, posture, weight, limit)
+        times.append(1e3 * (time.process_time() - begin) / count)
+        at.put(found, step.take(found))
+        failed += ~found
+    walks = []
+    for i, goal in enumerate(goals):
+        reached = configuration(at.base.pos[i], at.base.rot[i], at.joints[i])
+        walks.append(Walk(times, int(failed[i]), _errors(model, reached, goal, problem.soles)))
+    return walks
 
 
 def _row(name: str, qp: str, walks: list[Walk]) -> dict:
@@ -330,7 +164,7 @@ def _row(name: str, qp: str, walks: list[Walk]) -> dict:
         "QP solver": qp,
         "median [ms]": float(np.median(times)),
         "P99 [ms]": float(np.percentile(times, 99)),
-        "times placo": np.nan,  # set when all are known
+        "times daqp": np.nan,  # set when all are known
         "steps": len(times),
         "no solution": sum(walk.failed for walk in walks),
         "hand [mm]": 1e3 * float(np.median(position)),
@@ -342,12 +176,13 @@ def _row(name: str, qp: str, walks: list[Walk]) -> dict:
 
 def _problem() -> BenchProblem:
     robot = load_robot()
-    model = WholeBodyModel(robot)
-    soles_b = model.soles_in_base(robot.default_q)
-    pos, rot = base_from_stance(soles_b, np.array([0.0, 0.0, 1.0]), None)
-    stance = measured_stance([(pos + rot @ p, rot @ r) for p, r in soles_b])
-    q = configuration(pos, rot, robot.default_q)
-    return BenchProblem(robot, TUNED.weights, q, stance.poses(), stance.hull(model.corners))
+    kinematics, model = Kinematics(robot), WholeBodyModel(robot)
+    bodies = kinematics.at(robot.default_q[None])
+    base = base_from_stance(bodies, np.array([[0.0, 0.0, 1.0]]), None)
+    stance = measured_stance(base, bodies)
+    q = configuration(base.pos[0], base.rot[0], robot.default_q)
+    soles = list(zip(stance.pos()[0], stance.rot()[0], strict=True))
+    return BenchProblem(robot, TUNED.weights, q, soles, stance.hull(model.corners).corners(0))
 
 
 def _goals(problem: BenchProblem, count: int) -> list[Pose]:
@@ -369,7 +204,3 @@ def _errors(model: WholeBodyModel, q: Array, goal: Pose, soles: list[Pose]) -> t
         float(np.linalg.norm(turning)),
         float(np.linalg.norm(slips, axis=1).max()),
     )
-
-
-def _qp_solver() -> str:
-    return next(name for name in QP_SOLVERS if name in qpsolvers.available_solvers)
