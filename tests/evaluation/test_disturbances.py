@@ -12,7 +12,7 @@ from wbc_bench.controller import SIGNALS
 from wbc_bench.episodes.manifest import EpisodeManifest, neutral
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.randomization import resting_height, sample
-from wbc_bench.episodes.world import PAYLOAD, world_model
+from wbc_bench.episodes.world import _IDLE, PAYLOAD, world_model
 from wbc_bench.evaluation.observation import Sensors
 from wbc_bench.evaluation.simulation import Simulation
 from wbc_bench.robot import RobotConfig, load_robot
@@ -68,7 +68,30 @@ def test_protocols_without_payload_and_bumps_have_the_robot_s_own_model(smoke: E
         mujoco.mj_saveModel(model, None, buffer)
         return buffer.tobytes()
 
-    assert dump(world_model(smoke)) == dump(load_robot(smoke.robot).model(smoke.physics.timestep))
+    model = load_robot(smoke.robot).model(smoke.physics.timestep)
+    model.opt.disableflags |= _IDLE
+    assert dump(world_model(smoke)) == dump(model)
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_what_is_switched_off_in_the_engine_changes_no_bit(
+    smoke: EvalProtocol, calm_rows: CalmRows, monkeypatch: pytest.MonkeyPatch, uneven: bool
+) -> None:
+    protocol = with_ranges(smoke, payload=(0.0, 2.0), step_height=0.02 if uneven else 0.0)
+    pushed = np.linspace(0.0, 1.5, 8)[:, None] * [1.0, 0.5]  # some lie on the ground before others
+    rows = calm_rows(8, payload=np.linspace(0, 2, 8))
+    states = []
+    for off in (_IDLE, 0):
+        monkeypatch.setattr("wbc_bench.episodes.world._IDLE", off)
+        simulation, active = Simulation(protocol, rows), np.ones(8, dtype=bool)
+        simulation.push(pushed)
+        command = np.tile(simulation.robot.default_q, (8, 1))
+        for _ in range(29):
+            simulation.step(command, active)
+        state = simulation.step(command, active)
+        states.append(np.concatenate([simulation.qpos.ravel(), state.foot_force_w.ravel()]).tobytes())
+        assert state.ground_contact.any() and not state.ground_contact.all()
+    assert states[0] == states[1]
 
 
 def test_motor_strength_scales_the_torque_limits(smoke: EvalProtocol, calm_rows: CalmRows) -> None:

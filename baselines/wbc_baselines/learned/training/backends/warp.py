@@ -57,6 +57,7 @@ class WarpBackend:
         self._robot = load_robot(protocol.robot)
         self._decimation = protocol.physics.decimation
         self._host = model = world_model(protocol)
+        model.opt.disableflags = 0  # MuJoCo Warp refuses a flag of what it does not have
         self._device = wp.get_device(device)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
