@@ -157,7 +157,8 @@ def decode_parquet(
 
     with (
         reading(kind, path, "readable parquet", error),
-        pq.ParquetFile(pa.BufferReader(data), **options) as file,
+        # On this thread: one of arrow's pool that is still starting aborts a process that ends just then.
+        pq.ParquetFile(pa.BufferReader(data), pre_buffer=False, **options) as file,
     ):
         parts = [file.metadata.row_group(k) for k in range(file.metadata.num_row_groups)]
         found = file.metadata.num_rows
@@ -168,7 +169,7 @@ def decode_parquet(
             )
         if rows is not None and found != rows:
             raise error(f"{kind} '{path}' has {found} rows, valid: {rows}")
-        table = file.read(columns=only)
+        table = file.read(columns=only, use_threads=False)
         table.validate(full=True)
     check_columns(table, path, kind, error, columns or {})
     return table
