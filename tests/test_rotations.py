@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from wbc_bench.rotations import (
     geodesic_angle,
+    matrix_from_rho6,
     matrix_from_rotvec,
     matrix_from_rpy,
     matrix_from_wxyz,
@@ -99,6 +100,15 @@ def test_geodesic_angle_is_a_metric() -> None:
     assert (geodesic_angle(a, c) <= geodesic_angle(a, b) + geodesic_angle(b, c) + 1e-12).all()
     close(geodesic_angle(c @ a, c @ b), geodesic_angle(a, b), 1e-12)  # the same in every frame
     assert (geodesic_angle(a, b) <= np.pi).all()
+
+
+def test_rho6_and_back_also_of_noisy_columns() -> None:
+    np.testing.assert_allclose(matrix_from_rho6(rho6(ROT)), ROT, atol=1e-12)
+    noisy = matrix_from_rho6(rho6(ROT) + 0.05 * np.random.default_rng(3).normal(size=(len(ROT), 6)))
+    np.testing.assert_allclose(
+        np.swapaxes(noisy, -1, -2) @ noisy, np.broadcast_to(np.eye(3), ROT.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(noisy), 1.0, atol=1e-12)
 
 
 def test_rho6_is_two_columns_that_give_the_third() -> None:

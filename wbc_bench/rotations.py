@@ -108,3 +108,15 @@ def geodesic_angle(a: Array, b: Array) -> Array:
 def rho6(rot: Array) -> Array:
     """First two columns (..., 6) of rotation matrices (..., 3, 3). Source: paper eq. 1 (Zhou et al. 2019)."""
     return np.concatenate([rot[..., :, 0], rot[..., :, 1]], axis=-1)
+
+
+def matrix_from_rho6(columns: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of two noisy columns (..., 6), by Gram-Schmidt.
+
+    Source: Zhou et al. 2019, "On the Continuity of Rotation Representations", eq. 15.
+    """
+    x, y = columns[..., :3], columns[..., 3:]
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    y = y - (x * y).sum(axis=-1, keepdims=True) * x
+    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], axis=-1)

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CalmRows
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Signal, Target
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
@@ -361,3 +362,22 @@ def test_a_controller_is_shown_what_it_declared(short: EvalProtocol, disturbed: 
         assert obs.time == pytest.approx(0.02 * step)
         assert target.pos_b.shape == (6, 3) and target.rot_b.shape == (6, 3, 3)
     assert blind.first[0] is blind.seen[0][0]  # reset sees what the first act sees
+
+
+def test_matrix_products_run_on_one_thread(short: EvalProtocol, calm_rows: CalmRows) -> None:
+    """Whatever the caller's process is set to, which is as it was afterwards."""
+
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    found = []
+
+    def watching(robot: Robot, step: int, obs: Observation, target: Target, q: np.ndarray) -> np.ndarray:
+        found.append(threads())
+        return q
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threads()
+        rollout(Recorder(watching), short, calm_rows(2))
+        assert threads() == before
+    assert found and all(each == {1} for each in found)

@@ -15,6 +15,7 @@ from trainers import TINY, trainer
 from training_targets import PROTOCOL, TARGETS
 from wbc_baselines.learned.policy import checkpoint
 from wbc_baselines.learned.policy.export import write_onnx
+from wbc_baselines.learned.policy.inputs import HISTORY_FRAME
 from wbc_baselines.learned.policy.onnx_engine import OnnxEngine, seal
 from wbc_baselines.learned.policy.policy import Policy
 from wbc_baselines.learned.training.campaign import is_done, standing
@@ -55,7 +56,8 @@ def write_exported(folder: Path) -> None:
 
 def read_exported(folder: Path) -> None:
     engine = OnnxEngine(folder / "policy.onnx")
-    engine({name: torch.zeros(2, *shape) for name, shape in engine.flow.inputs.items()})
+    values = {name: np.zeros((2, *shape), np.float32) for name, shape in engine.flow.inputs.items()}
+    engine(values, engine.begin(np.zeros((2, HISTORY_FRAME), np.float32)))
 
 
 def seal_exported(folder: Path) -> None:

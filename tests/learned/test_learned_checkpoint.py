@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from policies import networks, write
-from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy import checkpoint, weights
 from wbc_baselines.learned.policy.card import FORMAT, CheckpointError, check_fit, read_card
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.episodes.protocol import find_protocol
@@ -218,11 +218,11 @@ def test_another_control_period(sound):
 
 
 def test_names_of_shipped_checkpoints(tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path)
+    monkeypatch.setattr(weights, "CHECKPOINTS", tmp_path)
     write(tmp_path / "limx_adapter", "cenet", seed=0)
     write(tmp_path / "limx_adapter", "gru", seed=1)
-    assert checkpoint.available("limx_adapter") == ["cenet@0", "gru@1"]
-    assert checkpoint.available("paper") == []
+    assert weights.available("limx_adapter") == ["cenet@0", "gru@1"]
+    assert weights.available("paper") == []
     assert load_controller("learned:cenet@0", load_robot()).info.name == "learned:cenet@0"
     with pytest.raises(UnknownNameError, match=r"unknown checkpoint 'gru@0'.*did you mean gru@1"):
         load_controller("learned:gru@0", load_robot())

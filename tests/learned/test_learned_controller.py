@@ -10,13 +10,12 @@ import pytest
 import torch
 from conftest import CalmRows
 
-from policies import networks, write
+from policies import TorchEngine, networks, numpy_policy, write
 from tiny_protocol import write_tiny
-from wbc_baselines.learned.policy import checkpoint, inputs
+from wbc_baselines.learned.policy import checkpoint, inputs, weights
 from wbc_baselines.learned.policy.card import new_card, other_conditions
 from wbc_baselines.learned.policy.controller import LearnedController
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.cli.main import main
 from wbc_bench.controller import DEPLOYABLE, Observation, Target
 from wbc_bench.episodes.manifest import manifest_path, read_manifest
@@ -34,26 +33,25 @@ from wbc_bench.rotations import geodesic_angle
 COUNT = 4
 
 
-class Recording:
+class Recording(TorchEngine):
     """A policy that also writes down what it was given."""
 
     def __init__(self, method: str) -> None:
-        self._policy = Policy(*networks(method))
-        self.flow = self._policy.flow
-        self.seen: list[dict[str, torch.Tensor]] = []
-        self.found: list[dict[str, torch.Tensor]] = []
+        super().__init__(*networks(method))
+        self.seen: list[dict[str, np.ndarray]] = []
+        self.found: list[dict[str, np.ndarray]] = []
 
-    def __call__(self, values: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        self.seen.append(values)
-        self.found.append(self._policy(values))
-        return self.found[-1]
+    def __call__(self, values, carried):
+        self.seen.append({**values, **{name: value.numpy() for name, value in carried.items()}})
+        found, carried = super().__call__(values, carried)
+        self.found.append({**found, **{name: value.numpy() for name, value in carried.items()}})
+        return found, carried
 
 
 def make(method: str, engine=None) -> LearnedController:
     card = new_card(method, 0, 0, 0.0, find_protocol("smoke_v1")[0])
-    return LearnedController(
-        load_robot(), card, engine or Policy(*networks(method)), f"learned:{method}@0", ""
-    )
+    policy = engine or numpy_policy(method, *networks(method))
+    return LearnedController(load_robot(), card, policy, f"learned:{method}@0", "")
 
 
 class Stream:
@@ -104,18 +102,18 @@ def test_what_the_policy_is_given(stream):
     pairs = zip(engine.seen, observed, strict=True)
     for k, (values, (obs, target)) in enumerate(pairs):
         assert obs.proprioception is not None and obs.ee_pose is not None
-        x = values["observation"].numpy()
+        x = values["observation"]
         np.testing.assert_allclose(x[:, :3], obs.proprioception.base_ang_vel_b, rtol=1e-6)
         np.testing.assert_allclose(x[:, 6:20], obs.proprioception.joint_pos - robot.default_q, atol=1e-6)
-        previous = engine.found[k - 1]["action"].numpy() if k else np.zeros((COUNT, 14))
+        previous = engine.found[k - 1]["action"] if k else np.zeros((COUNT, 14))
         np.testing.assert_array_equal(x[:, 34:48], previous)
         np.testing.assert_allclose(x[:, 48:51], obs.ee_pose.pos_b, rtol=1e-6)
         np.testing.assert_allclose(values["command"][:, :3], target.pos_b, rtol=1e-6)
         np.testing.assert_allclose(values["term"][:, 34:48], obs.proprioception.joint_torque, rtol=1e-6)
-    terms = torch.stack([values["term"] for values in engine.seen])
+    terms = np.stack([values["term"] for values in engine.seen])
     for k, found in enumerate(engine.found):
-        expected = terms[[max(0, k - back) for back in range(9, -1, -1)]].transpose(0, 1)
-        assert torch.equal(found["window"], expected)  # filled with the first term
+        expected = terms[[max(0, k - back) for back in range(9, -1, -1)]].swapaxes(0, 1)
+        np.testing.assert_array_equal(found["window"], expected)  # filled with the first term
     assert (engine.seen[0]["state"] == 0).all() and (engine.seen[1]["state"] != 0).any()
 
 
@@ -143,7 +141,7 @@ def test_the_protocol_sets_the_decay(smoke: EvalProtocol, calm_rows: CalmRows):
     engine = Recording("no_latent")
     rollout(make("no_latent", engine), slower, calm_rows(2))
     first, second = (values["observation"][:, 57] for values in engine.seen[:2])
-    torch.testing.assert_close(first - second, torch.full((2,), 0.01), atol=1e-5, rtol=0)
+    np.testing.assert_allclose(first - second, 0.01, atol=1e-5)
 
 
 def test_the_oracle_is_given_the_truth(stream):
@@ -151,9 +149,7 @@ def test_the_oracle_is_given_the_truth(stream):
     drive(make("oracle", engine), stream, 6)
     *_, (obs, _) = stream(make("oracle").info.signals, 6)
     assert obs.privileged is not None and obs.base_pose is not None
-    found = np.split(
-        engine.seen[-1]["privileged"].numpy(), np.cumsum([t.size for t in inputs.PRIVILEGED_LAYOUT]), 1
-    )
+    found = np.split(engine.seen[-1]["privileged"], np.cumsum([t.size for t in inputs.PRIVILEGED_LAYOUT]), 1)
     known = obs.privileged
     expected = [
         *(known.base_lin_vel_b, known.joint_torque, known.joint_acc, obs.base_pose.pos_w[:, 2:]),
@@ -212,7 +208,7 @@ def test_command_is_default_plus_scaled_action(stream):
     robot = load_robot()
     scale = np.array([0.6] * 8 + [0.3] * 3 + [0.2] * 3)
     for command, found in zip(commands, engine.found, strict=True):
-        np.testing.assert_allclose(command, robot.default_q + scale * found["action"].numpy(), atol=1e-12)
+        np.testing.assert_allclose(command, robot.default_q + scale * found["action"], atol=1e-12)
 
 
 def test_a_period_that_does_not_divide_is_refused(smoke: EvalProtocol, calm_rows: CalmRows):
@@ -223,7 +219,7 @@ def test_a_period_that_does_not_divide_is_refused(smoke: EvalProtocol, calm_rows
 
 def test_one_seed_a_replicate(capsys, tmp_path, monkeypatch):
     """`learned:METHOD` is met by seed k in replicate k; a missing seed is an error."""
-    monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path / "shipped")
+    monkeypatch.setattr(weights, "CHECKPOINTS", tmp_path / "shipped")
     written = [write(tmp_path / "shipped" / "limx_adapter", "cenet", seed) for seed in (0, 1)]
     tiny = write_tiny(tmp_path, replicates=3)
     out = tmp_path / "out"
@@ -255,7 +251,7 @@ def test_the_study_says_which_seeds_are_missing(tmp_path, monkeypatch):
     from wbc_bench.evaluation.workers import Engine
     from wbc_bench.results.store import ResultStore
 
-    monkeypatch.setattr(checkpoint, "CHECKPOINTS", tmp_path)
+    monkeypatch.setattr(weights, "CHECKPOINTS", tmp_path)
     write(tmp_path / "limx_adapter", "gru", 1)
     store, asked = ResultStore(tmp_path / "out"), Asked.of(str(write_tiny(tmp_path, replicates=3)))
     found = evaluate_all(["learned:gru", "learned:oracle"], asked, store, Engine(), optional=True)
@@ -286,7 +282,7 @@ def test_the_shard_defines_an_episode():
 def test_conditions_other_than_the_training_s_are_listed():
     protocol, _ = find_protocol("ablation_v1")
     card = new_card("no_latent", 0, 0, 0.0, protocol)
-    controller = LearnedController(load_robot(), card, Policy(*networks("no_latent")), "mine", "")
+    controller = LearnedController(load_robot(), card, TorchEngine(*networks("no_latent")), "mine", "")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         controller.prepare(protocol)
@@ -327,10 +323,9 @@ def test_the_latent_is_what_the_actor_reads():
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, 2)
     controller = make("transformer_gru", policy)
     rollout(controller, protocol, rows)
-    window = policy.found[-1]["window"]
-    state = policy.seen[-1]["state"]
+    window, state = policy.found[-1]["window"], policy.seen[-1]["state"]
     with torch.inference_mode():
-        context, _ = policy._policy.estimator.step(window, state)
+        context, _ = policy.policy.estimator.step(torch.from_numpy(window), torch.from_numpy(state))
     np.testing.assert_array_equal(controller.latent(), context[:, 3:].numpy())
 
 

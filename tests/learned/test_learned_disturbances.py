@@ -90,7 +90,7 @@ def test_an_episode_of_deploy_is_the_evaluations():
         np.testing.assert_allclose(
             seen.policy[:, inputs.OBSERVATION :], np.concatenate(command, axis=1), **tolerance
         )
-        known = _privileged(obs).numpy()
+        known = _privileged(obs)
         known[:, 17:31] = seen.critic[:, PRIVILEGED_COLUMNS][
             :, 17:31
         ]  # accelerations, differences of float32

@@ -6,6 +6,7 @@ from torch import nn
 from torch.distributions import Normal, kl_divergence
 
 from policies import batch
+from wbc_baselines.learned.policy.architecture import sinusoids
 from wbc_baselines.learned.policy.estimators import ESTIMATORS, make_estimator
 from wbc_baselines.learned.policy.estimators.latent import (
     KL_WEIGHT,
@@ -15,7 +16,7 @@ from wbc_baselines.learned.policy.estimators.latent import (
     split,
 )
 from wbc_baselines.learned.policy.estimators.memory import Memory
-from wbc_baselines.learned.policy.estimators.window import Layer, WindowEncoder, sinusoids
+from wbc_baselines.learned.policy.estimators.window import Layer, WindowEncoder
 
 LATENT = ("cenet", "gru", "transformer", "transformer_gru")
 
@@ -94,7 +95,7 @@ def test_positions_by_hand():
     found = sinusoids(10, 128)
     assert found[0].tolist() == [0.0, 1.0] * 64
     angle = torch.tensor(3 / 10000 ** (6 / 128))
-    torch.testing.assert_close(found[3, 6:8], torch.stack([angle.sin(), angle.cos()]))
+    torch.testing.assert_close(torch.from_numpy(found)[3, 6:8], torch.stack([angle.sin(), angle.cos()]))
 
 
 @pytest.mark.parametrize("name", LATENT)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from wbc_baselines.learned.policy import inputs, reference
+from wbc_baselines.learned.policy import inputs, poses, reference
 from wbc_baselines.learned.policy.normalizer import FLOOR, Normalizer
 from wbc_bench.cli.main import main
 from wbc_bench.rotations import geodesic_angle, matrix_from_rotvec, rho6
@@ -87,7 +87,7 @@ def test_pose_errors_agree_with_the_harness():
     rng = np.random.default_rng(1)
     a, b = (matrix_from_rotvec(rng.normal(size=(50, 3))) for _ in range(2))
     pos, goal = rng.normal(size=(2, 50, 3))
-    found = reference.pose_errors(*(torch.from_numpy(x) for x in (pos, a, goal, b)))
+    found = poses.pose_errors(*(torch.from_numpy(x) for x in (pos, a, goal, b)))
     np.testing.assert_allclose(found[0], np.linalg.norm(pos - goal, axis=1))
     np.testing.assert_allclose(found[1], geodesic_angle(a, b), atol=1e-7)
 
@@ -95,8 +95,8 @@ def test_pose_errors_agree_with_the_harness():
 def test_gram_schmidt_restores_rotations_and_makes_noisy_ones_proper():
     rot = matrix_from_rotvec(np.random.default_rng(2).normal(size=(20, 3)))
     columns = torch.from_numpy(rho6(rot))
-    np.testing.assert_allclose(reference.rotation_from_rho6(columns), rot, atol=1e-12)
-    noisy = reference.rotation_from_rho6(columns + 0.05 * torch.randn(20, 6, generator=torch.Generator()))
+    np.testing.assert_allclose(poses.rotation_from_rho6(columns), rot, atol=1e-12)
+    noisy = poses.rotation_from_rho6(columns + 0.05 * torch.randn(20, 6, generator=torch.Generator()))
     eye = noisy.transpose(1, 2) @ noisy
     torch.testing.assert_close(eye, torch.eye(3, dtype=eye.dtype).expand(20, 3, 3), atol=1e-12, rtol=0)
     assert torch.linalg.det(noisy).sub(1).abs().max() < 1e-12

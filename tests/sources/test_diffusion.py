@@ -368,7 +368,7 @@ def test_broken_policies_are_one_line(capsys, tmp_path: Path, how: str) -> None:
         ("extra", "it has tensors that the method does not know, more (1 in all)"),
         ("missing", "it lacks action_half (1 in all)"),
         ("shape", "wrong shape of action_half (159,), valid: (160,)"),
-        ("type", "wrong type of action_half torch.float64, valid: torch.float32"),
+        ("type", "wrong type of action_half F64, valid: F32"),
         ("infinite", "not a number in action_half"),
     ],
 )

@@ -9,13 +9,13 @@ import msgspec
 
 from wbc_baselines.learned.packaged import CHECKPOINTS
 from wbc_bench.controller import Controller
-from wbc_bench.errors import ControllerError, missing_extra
+from wbc_bench.errors import ControllerError
 from wbc_bench.readers import read_json
 from wbc_bench.robot import Robot
 
 
 class _Training(msgspec.Struct, frozen=True):
-    """What `variants` reads of a `policy.card.PolicyCard`, whose module imports torch."""
+    """What `variants` reads of a `policy.card.PolicyCard`."""
 
     method: str
     seed: int
@@ -23,14 +23,11 @@ class _Training(msgspec.Struct, frozen=True):
 
 
 class Learned:
-    """The entry point of learned controllers; torch is imported only when a controller is created."""
+    """The entry point of learned controllers, which are evaluated by NumPy alone."""
 
     def __call__(self, robot: Robot, variant: str = "") -> Controller:
         """Create the controller of a checkpoint, see `policy.controller.from_checkpoint`."""
-        try:
-            from wbc_baselines.learned.policy.controller import from_checkpoint
-        except ImportError as error:
-            raise ControllerError(missing_extra("a learned controller", "learned", error)) from error
+        from wbc_baselines.learned.policy.controller import from_checkpoint
 
         return from_checkpoint(robot, variant)
 
@@ -61,10 +58,8 @@ class Onnx:
 
     def __call__(self, robot: Robot, variant: str = "") -> Controller:
         """Create the controller of an exported file `onnx:FILE`, see `policy.controller.from_onnx`."""
-        try:
-            from wbc_baselines.learned.policy.controller import from_onnx
-        except ImportError as error:
-            raise ControllerError(missing_extra("an exported policy", "learned", error)) from error
+        from wbc_baselines.learned.policy.controller import from_onnx
+
         return from_onnx(robot, variant)
 
     def variants(self) -> list[tuple[str, str]]:

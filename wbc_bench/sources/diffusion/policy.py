@@ -106,7 +106,10 @@ def load_policy(path: Path) -> tuple[Policy, DoorPolicyCard, str]:
     data = read_bytes(path, "policy", SourceError)
     card = _card(data, path)
     policy = Policy(card.hidden)
-    policy.load_state_dict(decode_tensors(data, path, "policy", SourceError, policy.state_dict()))
+    state = policy.state_dict()
+    shapes = {name: tuple(value.shape) for name, value in state.items()}
+    for name, array in decode_tensors(data, path, "policy", SourceError, shapes).items():
+        state[name].copy_(torch.from_numpy(array))
     return policy.eval(), card, hashlib.sha256(data).hexdigest()
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.estimators import Estimator, Oracle, make_estimator
+from wbc_baselines.learned.policy.architecture import ORACLE_CONTEXTS, SIZES
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench import provenance
 from wbc_bench.episodes.protocol import EvalProtocol
@@ -168,7 +168,7 @@ def new_card(method: str, seed: int, samples: int, wall_time: float, protocol: E
         robot=facts,
         git_commit=commit,
         git_dirty=dirty,
-        dimensions=_dimensions(make_estimator(METHODS[method].estimator)),
+        dimensions=_dimensions(method),
     )
 
 
@@ -212,7 +212,7 @@ def decode_card(text: bytes, where: str) -> PolicyCard:
     card = decode_json(text, where, PolicyCard, "checkpoint card", CheckpointError)
     if card.method not in METHODS:
         raise UnknownNameError("method", card.method, METHODS, where)
-    here = _dimensions(estimator_of(card))
+    here = _dimensions(card.method, card.dimensions.context)
     if differences := _differences(card.dimensions, here):
         raise CheckpointError(f"checkpoint card '{where}' has other dimensions: {differences}")
     if card.robot_digest != _digest(card.robot):
@@ -242,21 +242,6 @@ def check_fit(card: PolicyCard, robot: Robot | None, control_period: float | Non
         raise CheckpointError(f"checkpoint '{where}' was trained on another robot: {differences}")
 
 
-def estimator_of(card: PolicyCard) -> Estimator:
-    """Create the estimator of a policy, with random weights.
-
-    Args:
-        card: Card of the policy, of a method that exists.
-
-    Returns:
-        The estimator; that of an oracle has as many columns as the oracle was trained with.
-    """
-    name = METHODS[card.method].estimator
-    if name == "oracle" and card.dimensions.context in Oracle.context_dims:
-        return Oracle(card.dimensions.context)
-    return make_estimator(name)
-
-
 def card_path(path: Path) -> Path:
     """Return the path of the card of a safetensors file, which is stored beside it."""
     return path.with_suffix(".json")
@@ -266,14 +251,16 @@ class _Version(msgspec.Struct):
     format: int
 
 
-def _dimensions(estimator: Estimator) -> Dimensions:
+def _dimensions(method: str, context: int | None = None) -> Dimensions:
+    """Those of a method; of an oracle, those with as many columns of context as it has, if there are such."""
+    sizes = SIZES[METHODS[method].estimator]
     return Dimensions(
         observation=inputs.OBSERVATION,
         command=inputs.COMMAND,
         history=inputs.HISTORY,
         history_frame=inputs.HISTORY_FRAME,
-        context=estimator.context_dim,
-        state=estimator.state_dim,
+        context=context if method == "oracle" and context in ORACLE_CONTEXTS else sizes.context,
+        state=sizes.state,
         actions=inputs.ACTIONS,
     )
 

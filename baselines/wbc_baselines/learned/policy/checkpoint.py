@@ -1,31 +1,24 @@
-"""Checkpoints: weights and normalizers as safetensors, with a card (see `card`) beside them."""
+"""Checkpoints as networks of torch: weights and normalizers as safetensors, with a card beside them.
+
+See `weights` for their files and `card` for the card.
+"""
 
 import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+import torch
 from safetensors.torch import save as bytes_of
 
-from wbc_baselines.learned.packaged import CHECKPOINTS
-from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.card import (
-    CheckpointError,
-    PolicyCard,
-    card_path,
-    check_fit,
-    estimator_of,
-    read_card,
-)
-from wbc_baselines.learned.policy.estimators import Estimator
+from wbc_baselines.learned.policy import inputs, weights
+from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, card_path, read_card
+from wbc_baselines.learned.policy.estimators import Estimator, Oracle, make_estimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.networks import Actor
 from wbc_bench.episodes.protocol import EvalProtocol
-from wbc_bench.errors import UnknownNameError
 from wbc_bench.files import write_atomic
-from wbc_bench.readers import is_file, read_bytes
-from wbc_bench.robot import Robot, load_robot
-from wbc_bench.tensors import decode_tensors
+from wbc_bench.robot import Robot
 
 
 class Checkpoint(NamedTuple):
@@ -56,10 +49,7 @@ def save(path: Path, actor: Actor, estimator: Estimator, card: PolicyCard) -> No
 
 
 def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None = None) -> Checkpoint:
-    """Load a checkpoint and check it.
-
-    A policy may be evaluated with other targets, noise, randomization, pushes and physics steps than those of
-    its training. Robot and control period must be the same.
+    """Load the networks of a checkpoint, see `weights.read`.
 
     Args:
         path: PATH.safetensors.
@@ -70,34 +60,26 @@ def load(path: Path, robot: Robot | None = None, protocol: EvalProtocol | None =
         Card and networks in evaluation mode.
 
     Raises:
-        CheckpointError: A file is missing, truncated or altered, or dimensions, robot or control period
-            differ.
+        CheckpointError: The files are damaged, or do not fit robot or protocol.
         UnknownNameError: There is no such method.
     """
-    card = read_card(path)
-    data = read_bytes(path, "checkpoint", CheckpointError)
-    found = hashlib.sha256(data).hexdigest()
-    if found != card.sha256:
-        raise CheckpointError(
-            f"checkpoint '{path}' is truncated or altered: SHA-256 {found[:12]} of {len(data)} bytes, "
-            f"its card says {card.sha256[:12]}"
-        )
-    if protocol is not None:
-        robot = load_robot(protocol.robot)
-    check_fit(card, robot, protocol.control_period if protocol else None, str(path))
-    estimator = estimator_of(card)
+    card, tensors = weights.read(path, robot, protocol)
+    estimator = make_estimator(METHODS[card.method].estimator)
+    if isinstance(estimator, Oracle):
+        estimator = Oracle(card.dimensions.context)  # of as many columns as it was trained with
     actor = Actor(estimator.context_dim)
-    modules = {"actor": actor, "estimator": estimator}
-    wanted = {f"{part}.{name}": v for part, m in modules.items() for name, v in m.state_dict().items()}
-    tensors = decode_tensors(data, path, "checkpoint", CheckpointError, wanted)
-    for name, value in wanted.items():
-        value.copy_(tensors[name])
+    for part, module in (("actor", actor), ("estimator", estimator)):
+        for name, value in module.state_dict().items():
+            value.copy_(torch.from_numpy(tensors[f"{part}.{name}"]))
     return Checkpoint(card, actor.eval(), estimator.eval())
 
 
 def identity(name: str, robot: str) -> str:
     """Return name and SHA-256 of a checkpoint, for the cards of those trained from it; "" for no name."""
-    return f"{find(name, robot).stem} {read_card(find(name, robot)).sha256}" if name else ""
+    if not name:
+        return ""
+    path = weights.find(name, robot)
+    return f"{path.stem} {read_card(path).sha256}"
 
 
 def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
@@ -115,7 +97,7 @@ def load_init_checkpoint(name: str, estimator: str, robot: str) -> Checkpoint:
         CheckpointError: It has a different estimator; and see `load`.
         UnknownNameError: There is no such checkpoint.
     """
-    found = load(find(name, robot))
+    found = load(weights.find(name, robot))
     theirs = METHODS[found.card.method]
     if theirs.estimates and theirs.estimator != estimator:
         raise CheckpointError(
@@ -154,43 +136,9 @@ def load_teacher(name: str, robot: str) -> Checkpoint:
         CheckpointError: Its context is estimated from a history; and see `load`.
         UnknownNameError: There is no such checkpoint.
     """
-    found = load(find(name, robot))
+    found = load(weights.find(name, robot))
     if found.estimator.trainable:
         raise CheckpointError(
             f"--teacher '{name}' is of {found.card.method}, valid: a method without an estimated context"
         )
     return found
-
-
-def find(name: str, robot: str) -> Path:
-    """Find the file of a checkpoint.
-
-    Args:
-        name: METHOD@SEED of a checkpoint of this package, ROBOT/METHOD@SEED for another robot's, or
-            PATH.safetensors.
-        robot: Variant of the robot, of which each has checkpoints of its own.
-
-    Returns:
-        The safetensors file.
-
-    Raises:
-        UnknownNameError: There is no such checkpoint; the nearest names are listed.
-    """
-    if name.endswith(".safetensors"):
-        return Path(name)
-    their_robot, _, name = name.rpartition("/")
-    robot = their_robot or robot
-    path = CHECKPOINTS / robot / f"{name}.safetensors"
-    if not is_file(path):
-        known = available(robot)
-        method = name.partition("@")[0]
-        if method not in METHODS:
-            raise UnknownNameError("checkpoint", name, known or METHODS, "METHOD@SEED or PATH.safetensors")
-        where = f"{METHODS[method].label}: none trained or shipped for the robot '{robot}'"
-        raise UnknownNameError("checkpoint", name, known, where)
-    return path
-
-
-def available(robot: str) -> list[str]:
-    """List the checkpoints of this package for a variant of the robot as METHOD@SEED."""
-    return sorted(path.stem for path in (CHECKPOINTS / robot).glob("*@*.safetensors"))

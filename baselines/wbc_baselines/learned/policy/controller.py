@@ -1,38 +1,62 @@
 """Trained policies as controllers of the benchmark: batched, deterministic, on one thread."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from wbc_baselines.learned.policy import checkpoint, inputs
+from wbc_baselines.learned.policy import inputs, weights
+from wbc_baselines.learned.policy.architecture import Flow
 from wbc_baselines.learned.policy.card import CheckpointError, PolicyCard, check_fit, other_conditions
 from wbc_baselines.learned.policy.methods import METHODS
-from wbc_baselines.learned.policy.onnx_engine import OnnxEngine
-from wbc_baselines.learned.policy.policy import Flow, Policy
-from wbc_baselines.learned.policy.reference import (
-    advance,
-    initial_reference,
-    pose_errors,
-    rotation_from_rho6,
-)
+from wbc_baselines.learned.policy.numpy_policy import NumpyPolicy
+from wbc_baselines.learned.policy.reference import advance, initial_reference
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.episodes.protocol import EvalProtocol
+from wbc_bench.errors import missing_extra
 from wbc_bench.robot import Robot
+from wbc_bench.rotations import geodesic_angle, matrix_from_rho6
 
+Array = NDArray[np.float32]
 REFERENCE_DECAY = 1.0  # [1/s] where no protocol says otherwise. Source: default of wbc_bench.protocol
 
 
 class Engine(Protocol):
-    """The implementation that computes a policy: torch, or a runtime of exported files."""
+    """The implementation that computes a policy: NumPy, or a runtime of exported files.
 
-    flow: Flow
+    What it carries from step to step, window and recurrent state in whatever form, is its own business.
+    """
 
-    def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]: ...
+    @property
+    def flow(self) -> Flow:
+        """Names and shapes of what it computes an action from."""
+        ...
+
+    def begin(self, frame: Array) -> Any:
+        """Begin N episodes.
+
+        Args:
+            frame: (N, 57) The first frames; the windows are filled with them.
+
+        Returns:
+            What is carried into the first step.
+        """
+        ...
+
+    def __call__(self, values: Mapping[str, Array], carried: Any) -> tuple[dict[str, Array], Any]:
+        """Compute one control step.
+
+        Args:
+            values: Those of `observation`, `command`, `term` and `privileged` that are in `flow.inputs`.
+            carried: What the step before returned, or `begin`.
+
+        Returns:
+            `action`, and `latent` where there is one and the engine shows it; what the next step is given.
+        """
+        ...
 
 
 class LearnedController:
@@ -54,7 +78,6 @@ class LearnedController:
         sha256: str,
         files: tuple[Path, ...] = (),
     ) -> None:
-        torch.set_num_threads(1)
         period = card.robot.control_period
         trained = f"{card.samples:.3g} control steps of {card.protocol}"
         self.info = ControllerInfo(
@@ -62,8 +85,8 @@ class LearnedController:
         )
         self.card, self.checkpoint_sha256 = card, sha256
         self._robot, self._engine, self._decay = robot, engine, REFERENCE_DECAY
-        self._latent: Tensor | None = None
-        self._default_q = _tensor(robot.default_q)
+        self._latent: Array | None = None
+        self._default_q = _float32(robot.default_q)
 
     def prepare(self, protocol: EvalProtocol) -> None:
         """Take the decay of the reference from a protocol, and warn if its conditions differ from training.
@@ -81,46 +104,37 @@ class LearnedController:
             )
         self._decay = protocol.reference_decay
 
-    @torch.inference_mode()
+    @np.errstate(all="ignore")
     def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
         """Fill the windows with the first observation, and start with zero state and action."""
         assert obs.ee_pose is not None
-        pos, rot6 = _tensor(obs.ee_pose.pos_b), _tensor(obs.ee_pose.rot6_b)
-        errors = pose_errors(pos, rotation_from_rho6(rot6), _tensor(target.pos_b), _tensor(target.rot_b))
-        self._d_ref, self._first = initial_reference(*errors), True
-        count, flow = len(episodes), self._engine.flow.inputs
-        self._action = torch.zeros(count, inputs.ACTIONS)
-        self._carried: dict[str, Tensor] = {}
-        if "window" in flow:
-            self._carried["window"] = inputs.history_frame(*self._measured(obs))[:, None].repeat(
-                1, inputs.HISTORY, 1
-            )
-        if "state" in flow:
-            self._carried["state"] = torch.zeros(count, *flow["state"])
+        pos_err = np.linalg.norm(obs.ee_pose.pos_b - target.pos_b, axis=-1)
+        rot_err = geodesic_angle(matrix_from_rho6(obs.ee_pose.rot6_b), target.rot_b)
+        self._d_ref, self._first = initial_reference(_float32(pos_err), _float32(rot_err)), True
+        self._action = np.zeros((len(episodes), inputs.ACTIONS), np.float32)
+        self._carried = self._engine.begin(inputs.history_frame(*self._measured(obs)))
 
-    @torch.inference_mode()
+    @np.errstate(all="ignore")  # after a divergence the commands are no numbers, which the harness reports
     def act(self, obs: Observation, target: Target) -> JointCommand:
         """Compute the commands of one control step."""
         if not self._first:
             self._d_ref = advance(self._d_ref, self._decay, self.info.control_period)
         self._first = False
-        measured = self._measured(obs)
+        measured, flow = self._measured(obs), self._engine.flow.inputs
         gyro, gravity, joint_pos, joint_vel, _, ee = measured
         values = {
             "observation": inputs.observation(
                 gyro, gravity, joint_pos, joint_vel, self._action, ee, self._d_ref
             ),
-            "command": inputs.command(_tensor(target.pos_b), _tensor(target.rot_b)),
-            **self._carried,
+            "command": inputs.command(_float32(target.pos_b), _float32(target.rot_b)),
         }
-        if "term" in self._engine.flow.inputs:
+        if "term" in flow:
             values["term"] = inputs.history_frame(*measured)
-        if "privileged" in self._engine.flow.inputs:
-            values["privileged"] = _privileged(obs)[:, : self._engine.flow.inputs["privileged"][0]]
-        found = self._engine(values)
-        self._carried = {name: found[name] for name in self._carried}
+        if "privileged" in flow:
+            values["privileged"] = _privileged(obs)[:, : flow["privileged"][0]]
+        found, self._carried = self._engine(values, self._carried)
         self._action, self._latent = found["action"], found.get("latent")
-        return JointCommand(self._robot.command_of(self._action.numpy().astype(np.float64)))
+        return JointCommand(self._robot.command_of(self._action.astype(np.float64)))
 
     def latent(self) -> NDArray[np.float64]:
         """Return the dynamics latent of the latest commands, without the estimated velocity.
@@ -136,7 +150,7 @@ class LearnedController:
             raise CheckpointError(
                 f"'{self.info.name}' shows no latent; valid: checkpoints (`learned:`) of {shown}"
             )
-        return self._latent.numpy().astype(np.float64)
+        return self._latent.astype(np.float64)
 
     def export(self, path: Path, format: str) -> None:
         """Write the policy as an ONNX file.
@@ -146,19 +160,25 @@ class LearnedController:
             format: Name of the format; there is only `onnx`.
 
         Raises:
-            CheckpointError: The policy comes from an exported file already.
+            CheckpointError: The policy comes from an exported file already, or torch is not installed.
         """
-        if not isinstance(self._engine, Policy):
+        if not isinstance(self._engine, NumpyPolicy):
             raise CheckpointError(f"'{self.info.name}' is an exported policy already")
-        from wbc_baselines.learned.policy.export import write_onnx
+        try:
+            from wbc_baselines.learned.policy import checkpoint
+            from wbc_baselines.learned.policy.export import write_onnx
+            from wbc_baselines.learned.policy.policy import Policy
+        except ImportError as error:
+            raise CheckpointError(missing_extra("an export", "learned", error)) from error
 
-        write_onnx(path, self._engine, self.card)
+        card, actor, estimator = checkpoint.load(self.info.files[0])
+        write_onnx(path, Policy(actor, estimator), card)
 
-    def _measured(self, obs: Observation) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _measured(self, obs: Observation) -> tuple[Array, Array, Array, Array, Array, Array]:
         """Gyro, gravity, joint positions about the default, velocities, torques, end-effector pose."""
         assert obs.proprioception is not None and obs.ee_pose is not None
-        gyro, gravity, joint_pos, joint_vel, torque = map(_tensor, obs.proprioception)
-        ee = torch.cat([_tensor(obs.ee_pose.pos_b), _tensor(obs.ee_pose.rot6_b)], dim=-1)
+        gyro, gravity, joint_pos, joint_vel, torque = map(_float32, obs.proprioception)
+        ee = np.concatenate([_float32(obs.ee_pose.pos_b), _float32(obs.ee_pose.rot6_b)], axis=-1)
         return gyro, gravity, joint_pos - self._default_q, joint_vel, torque, ee
 
 
@@ -176,17 +196,17 @@ def from_checkpoint(robot: Robot, variant: str) -> LearnedController:
         CheckpointError: The checkpoint is damaged or does not fit the robot.
         UnknownNameError: There is no such checkpoint.
     """
-    path = checkpoint.find(variant, robot.config.variant)
-    card, actor, estimator = checkpoint.load(path, robot)
-    name = f"learned:{card.method}@{card.seed}"
-    return LearnedController(robot, card, Policy(actor, estimator), name, card.sha256, (path,))
+    path = weights.find(variant, robot.config.variant)
+    card, tensors = weights.read(path, robot)
+    policy, name = NumpyPolicy(METHODS[card.method].estimator, tensors), f"learned:{card.method}@{card.seed}"
+    return LearnedController(robot, card, policy, name, card.sha256, (path,))
 
 
-def _tensor(array: NDArray[np.float64]) -> Tensor:
-    return torch.from_numpy(array.astype(np.float32))
+def _float32(array: NDArray[np.float64]) -> Array:
+    return array.astype(np.float32)
 
 
-def _privileged(obs: Observation) -> Tensor:
+def _privileged(obs: Observation) -> Array:
     """The oracle's context (N, 107), of which the first oracles have the first 80 columns."""
     assert obs.privileged is not None and obs.base_pose is not None
     known = obs.privileged
@@ -198,7 +218,7 @@ def _privileged(obs: Observation) -> Tensor:
         *(known.foot_force_w.reshape(-1, 6), known.payload, known.payload_offset, known.motor_strength),
         *(known.joint_offset, known.imu_tilt, delays, known.odometry_error_b),
     )
-    return inputs.privileged(*map(_tensor, parts))
+    return inputs.privileged(*map(_float32, parts))
 
 
 def from_onnx(robot: Robot, variant: str) -> LearnedController:
@@ -212,9 +232,14 @@ def from_onnx(robot: Robot, variant: str) -> LearnedController:
         The controller.
 
     Raises:
-        CheckpointError: The file is damaged or does not fit the robot.
+        CheckpointError: The file is damaged or does not fit the robot, or onnxruntime is not installed.
         UnknownNameError: There is no such method.
     """
+    try:
+        from wbc_baselines.learned.policy.onnx_engine import OnnxEngine
+    except ImportError as error:
+        raise CheckpointError(missing_extra("an exported policy", "learned", error)) from error
+
     engine = OnnxEngine(Path(variant))
     check_fit(engine.card, robot, None, variant)
     return LearnedController(robot, engine.card, engine, f"onnx:{variant}", engine.sha256, (Path(variant),))

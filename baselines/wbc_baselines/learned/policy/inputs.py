@@ -3,12 +3,17 @@
 The layouts below are the only definition of the dimensions; `wbc-bench list --inputs` prints them.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from wbc_bench.robot import NUM_JOINTS
 
-if TYPE_CHECKING:  # the table is printed where torch is not installed
+if TYPE_CHECKING:  # an evaluation assembles arrays, where torch may not be installed
     from torch import Tensor
+
+Array = TypeVar("Array", NDArray[np.float32], "Tensor")
 
 
 class Term(NamedTuple):
@@ -124,11 +129,16 @@ LAYOUTS: dict[str, Layout] = {
 }
 
 
-def _join(layout: Layout, *parts: "Tensor") -> "Tensor":
+def _join(layout: Layout, *parts: Array) -> Array:
     """Concatenate parts to (N, width); each may span several adjacent terms."""
-    import torch
+    every: Any = parts
+    joined: Any
+    if isinstance(every[0], np.ndarray):
+        joined = np.concatenate(every, axis=-1)
+    else:
+        import torch
 
-    joined = torch.cat(parts, dim=-1)
+        joined = torch.cat(every, dim=-1)
     if joined.shape[-1] != width(layout):
         sizes = " + ".join(str(part.shape[-1]) for part in parts)
         raise ValueError(f"{sizes} columns, the layout has {' + '.join(str(term.size) for term in layout)}")
@@ -136,69 +146,69 @@ def _join(layout: Layout, *parts: "Tensor") -> "Tensor":
 
 
 def observation(
-    ang_vel_b: "Tensor",
-    gravity_b: "Tensor",
-    joint_pos_rel: "Tensor",
-    joint_vel: "Tensor",
-    previous_action: "Tensor",
-    ee: "Tensor",
-    d_ref: "Tensor",
-) -> "Tensor":
+    ang_vel_b: Array,
+    gravity_b: Array,
+    joint_pos_rel: Array,
+    joint_vel: Array,
+    previous_action: Array,
+    ee: Array,
+    d_ref: Array,
+) -> Array:
     """Assemble the actor's observation (N, 58); `ee` (N, 9) is position and two columns, d_ref is (N,)."""
     parts = (ang_vel_b, gravity_b, joint_pos_rel, joint_vel, previous_action, ee, d_ref[..., None])
     return _join(OBSERVATION_LAYOUT, *parts)
 
 
-def command(target_pos_b: "Tensor", target_rot_b: "Tensor") -> "Tensor":
+def command(target_pos_b: Array, target_rot_b: Array) -> Array:
     """Assemble the command (N, 9) of a position (N, 3) [m] and a rotation (N, 3, 3). Source: paper, eq. 1."""
     return _join(COMMAND_LAYOUT, target_pos_b, target_rot_b[..., :, 0], target_rot_b[..., :, 1])
 
 
 def history_frame(
-    ang_vel_b: "Tensor",
-    gravity_b: "Tensor",
-    joint_pos_rel: "Tensor",
-    joint_vel: "Tensor",
-    joint_torque: "Tensor",
-    ee: "Tensor",
-) -> "Tensor":
+    ang_vel_b: Array,
+    gravity_b: Array,
+    joint_pos_rel: Array,
+    joint_vel: Array,
+    joint_torque: Array,
+    ee: Array,
+) -> Array:
     """Assemble one frame (N, 57) of an estimator's window."""
     return _join(HISTORY_LAYOUT, ang_vel_b, gravity_b, joint_pos_rel, joint_vel, joint_torque, ee)
 
 
 def next_observation(
-    ang_vel_b: "Tensor",
-    gravity_b: "Tensor",
-    joint_pos_rel: "Tensor",
-    joint_vel: "Tensor",
-    ee: "Tensor",
-    feet_b: "Tensor",
-) -> "Tensor":
+    ang_vel_b: Array,
+    gravity_b: Array,
+    joint_pos_rel: Array,
+    joint_vel: Array,
+    ee: Array,
+    feet_b: Array,
+) -> Array:
     """Assemble the decoder's target (N, 49) from true values; feet_b (N, 6) [m] is left, then right."""
     return _join(NEXT_OBSERVATION_LAYOUT, ang_vel_b, gravity_b, joint_pos_rel, joint_vel, ee, feet_b)
 
 
 def privileged(
-    base_lin_vel_b: "Tensor",
-    joint_torque: "Tensor",
-    joint_acc: "Tensor",
-    base_height: "Tensor",
-    ee_lin_vel_b: "Tensor",
-    ee_ang_vel_b: "Tensor",
-    feet_b: "Tensor",
-    kp_scale: "Tensor",
-    kd_scale: "Tensor",
-    base_mass: "Tensor",
-    friction: "Tensor",
-    foot_force_w: "Tensor",
-    payload: "Tensor",
-    payload_offset: "Tensor",
-    motor_strength: "Tensor",
-    joint_offset: "Tensor",
-    imu_tilt: "Tensor",
-    delays: "Tensor",
-    odometry_error_b: "Tensor",
-) -> "Tensor":
+    base_lin_vel_b: Array,
+    joint_torque: Array,
+    joint_acc: Array,
+    base_height: Array,
+    ee_lin_vel_b: Array,
+    ee_ang_vel_b: Array,
+    feet_b: Array,
+    kp_scale: Array,
+    kd_scale: Array,
+    base_mass: Array,
+    friction: Array,
+    foot_force_w: Array,
+    payload: Array,
+    payload_offset: Array,
+    motor_strength: Array,
+    joint_offset: Array,
+    imu_tilt: Array,
+    delays: Array,
+    odometry_error_b: Array,
+) -> Array:
     """Assemble the privileged vector (N, 107) of true values; heights, masses, factors of all are (N,).
 
     The end-effector's velocity is relative to the world, not to the base, and expressed in the base frame.

@@ -4,10 +4,9 @@ from itertools import pairwise
 
 from torch import Tensor, nn
 
+from wbc_baselines.learned.policy.architecture import HIDDEN
 from wbc_baselines.learned.policy.inputs import ACTIONS, COMMAND, OBSERVATION
 from wbc_baselines.learned.policy.normalizer import Normalizer
-
-HIDDEN = (512, 256, 128)  # Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
 
 
 class Actor(nn.Module):

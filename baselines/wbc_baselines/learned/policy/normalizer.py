@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-FLOOR = 1e-2  # added to the deviation, so that a constant column is not amplified. Source: rsl-rl-lib 5.5
+from wbc_baselines.learned.policy.architecture import FLOOR
 
 
 class Normalizer(nn.Module):

@@ -1,18 +1,21 @@
 """Policies of ONNX files, computed by onnxruntime on one thread."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
-from wbc_baselines.learned.policy.card import CheckpointError, decode_card, estimator_of
-from wbc_baselines.learned.policy.policy import flow_of
+from wbc_baselines.learned.policy import inputs
+from wbc_baselines.learned.policy.architecture import SIZES, flow_of
+from wbc_baselines.learned.policy.card import CheckpointError, decode_card
+from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.readers import is_file, read_bytes, reading
 
 OPSET = 17
+Array = NDArray[np.float32]
 CARD, DIGEST = "card", b"sha256"  # keys of the metadata
 
 
@@ -41,7 +44,8 @@ class OnnxEngine:
         if text is None:
             raise CheckpointError(f"'{path}' carries no card, valid: a file that `export` of wbc-bench wrote")
         self.card, self.sha256 = decode_card(text.encode(), str(path)), hashlib.sha256(data).hexdigest()
-        self.flow = flow_of(estimator_of(self.card))
+        sizes = SIZES[METHODS[self.card.method].estimator]
+        self.flow = flow_of(sizes._replace(context=self.card.dimensions.context))
         self._check_flow(path)
 
     def _check_flow(self, path: Path) -> None:
@@ -54,11 +58,24 @@ class OnnxEngine:
         if names != [_output(name) for name in outputs]:
             raise CheckpointError(f"'{path}' writes {names}, valid for {self.card.method}: {outputs}")
 
-    def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Compute one control step of N robots."""
-        arrays = {name: np.ascontiguousarray(values[name].numpy()) for name in self.flow.inputs}
-        found = self._session.run([_output(name) for name in self.flow.outputs], arrays)
-        return {n: torch.from_numpy(np.asarray(v)) for n, v in zip(self.flow.outputs, found, strict=True)}
+    def begin(self, frame: Array) -> dict[str, Array]:
+        """See `controller.Engine`."""
+        found = {}
+        if "window" in self.flow.inputs:
+            found["window"] = frame[:, None].repeat(inputs.HISTORY, axis=1)
+        if "state" in self.flow.inputs:
+            found["state"] = np.zeros((len(frame), *self.flow.inputs["state"]), np.float32)
+        return found
+
+    def __call__(
+        self, values: Mapping[str, Array], carried: dict[str, Array]
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """See `controller.Engine`."""
+        given = {**values, **carried}
+        arrays = {name: np.ascontiguousarray(given[name]) for name in self.flow.inputs}
+        results = self._session.run([_output(name) for name in self.flow.outputs], arrays)
+        found = {name: np.asarray(value) for name, value in zip(self.flow.outputs, results, strict=True)}
+        return found, {name: found.pop(name) for name in carried}
 
 
 def seal(data: bytes) -> bytes:

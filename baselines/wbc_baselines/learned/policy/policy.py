@@ -1,29 +1,12 @@
 """A trained method as one function of observation, window and recurrent state."""
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
+from wbc_baselines.learned.policy.architecture import Sizes, flow_of
 from wbc_baselines.learned.policy.estimators import Estimator
-from wbc_baselines.learned.policy.inputs import (
-    COMMAND,
-    HISTORY,
-    HISTORY_FRAME,
-    OBSERVATION,
-    VELOCITY,
-)
+from wbc_baselines.learned.policy.inputs import VELOCITY
 from wbc_baselines.learned.policy.networks import Actor
-
-
-class Flow(NamedTuple):
-    """Names and shapes of the inputs and outputs of a policy, without the batch axis in front.
-
-    The names are those of exported ONNX files; `term` is the newest frame of the window.
-    """
-
-    inputs: dict[str, tuple[int, ...]]
-    outputs: tuple[str, ...]  # `window` and `state` are the next step's inputs
 
 
 class Policy(nn.Module):
@@ -32,7 +15,7 @@ class Policy(nn.Module):
     def __init__(self, actor: Actor, estimator: Estimator) -> None:
         super().__init__()
         self.actor, self.estimator = actor, estimator
-        self.flow = flow_of(estimator)
+        self.flow = flow_of(Sizes(estimator.context_dim, estimator.state_dim, estimator.latent_dim))
 
     def forward(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
         """Compute one control step of N robots; returns those of `flow`, and any `latent`."""
@@ -48,18 +31,3 @@ class Policy(nn.Module):
             if "state" in values:
                 found["state"] = state
         return {"action": self.actor(torch.cat(parts, dim=-1))} | found
-
-
-def flow_of(estimator: Estimator) -> Flow:
-    """Return the inputs and outputs of a policy with this estimator."""
-    inputs: dict[str, tuple[int, ...]] = {"observation": (OBSERVATION,), "command": (COMMAND,)}
-    outputs = ["action"]
-    if estimator.trainable:
-        inputs |= {"term": (HISTORY_FRAME,), "window": (HISTORY, HISTORY_FRAME)}
-        outputs.append("window")
-        if estimator.state_dim:
-            inputs["state"] = (estimator.state_dim,)
-            outputs.append("state")
-    elif estimator.context_dim:
-        inputs["privileged"] = (estimator.context_dim,)
-    return Flow(inputs, tuple(outputs))

@@ -1,54 +1,32 @@
 """The task-progress reference, a distance that decays with time alone, and the phase derived from it."""
 
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
+
+from wbc_baselines.learned.policy.inputs import Array
+
+if TYPE_CHECKING:  # an evaluation needs no torch
+    from torch import Tensor
 
 GATE_SLOPE = 5.0  # k. Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e
 GATE_CENTRE = 1.0  # mu, in the unit of d_ref. Source: as above
 
 
-def initial_reference(pos_err: Tensor, rot_err: Tensor) -> Tensor:
+def initial_reference(pos_err: Array, rot_err: Array) -> Array:
     """Compute the initial d_ref (N,) of errors [m] and [rad]. Source: paper, eq. rfm_phase, first line."""
     return 2 * pos_err + rot_err
 
 
-def advance(d_ref: Tensor, decay: Tensor | float, period: float) -> Tensor:
+def advance(d_ref: Array, decay: Array | float, period: float) -> Array:
     """Advance d_ref (N,) by one control period [s]; decay [1/s].
 
     Source: paper, eq. rfm_phase, second line.
     """
-    return (d_ref - decay * period).clamp(min=0.0)
+    return (d_ref - decay * period).clip(min=0.0)
 
 
-def gate(d_ref: Tensor, k: float = GATE_SLOPE, mu: float = GATE_CENTRE) -> Tensor:
+def gate(d_ref: "Tensor", k: float = GATE_SLOPE, mu: float = GATE_CENTRE) -> "Tensor":
     """Compute the phase g (N,), near 1 while approaching and near 0 at the target.
 
     Source: paper, eq. rfm_phase.
     """
-    return torch.sigmoid(k * (d_ref - mu))
-
-
-def rotation_from_rho6(rho6: Tensor) -> Tensor:
-    """Orthonormalize two noisy columns (N, 6) to rotation matrices (N, 3, 3) by Gram-Schmidt.
-
-    Source: Zhou et al. 2019, "On the Continuity of Rotation Representations", eq. 15.
-    """
-    x, y = rho6[..., :3], rho6[..., 3:]
-    x = torch.nn.functional.normalize(x, dim=-1)
-    y = torch.nn.functional.normalize(y - (x * y).sum(-1, keepdim=True) * x, dim=-1)
-    return torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
-
-
-def twice_sine(rot: Tensor) -> Tensor:
-    """Compute the axes (N, 3) of rotations (N, 3, 3), with a length of twice the sine of the angle."""
-    skew = rot - rot.transpose(1, 2)
-    return torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
-
-
-def pose_errors(pos: Tensor, rot: Tensor, target_pos: Tensor, target_rot: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute position errors (N,) [m] and geodesic angles (N,) [rad] between poses in one frame.
-
-    Source: paper, section III-D; ||a - b||_F = 2 sqrt(2) sin(angle / 2).
-    """
-    chord = torch.linalg.matrix_norm(rot - target_rot) / (2 * 2**0.5)
-    return torch.linalg.vector_norm(pos - target_pos, dim=-1), 2 * torch.arcsin(chord.clamp(max=1.0))
+    return (k * (d_ref - mu)).sigmoid()

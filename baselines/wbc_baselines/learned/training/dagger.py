@@ -7,20 +7,18 @@ Source: Ross, Gordon, Bagnell 2011, "A reduction of imitation learning and struc
 online learning".
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from wbc_baselines.learned.policy.architecture import SIZES, flow_of
 from wbc_baselines.learned.policy.card import new_card
 from wbc_baselines.learned.policy.controller import LearnedController
-from wbc_baselines.learned.policy.estimators import make_estimator
 from wbc_baselines.learned.policy.networks import Actor
-from wbc_baselines.learned.policy.policy import flow_of
 from wbc_baselines.learned.training.resets import sample_episodes, scale_disturbances
 from wbc_baselines.learned.training.symmetry import input_mirror, joint_mirror
 from wbc_baselines.learned.training.target_set import TargetSet
@@ -72,18 +70,25 @@ class ImitationDataset(NamedTuple):
 class _StudentEngine:
     """The engine of the student: its actions where it acts, and the teacher's elsewhere."""
 
-    flow = flow_of(make_estimator("none"))
+    flow = flow_of(SIZES["none"])
 
-    def __init__(self, student: Actor | None, student_acts: Tensor) -> None:
+    def __init__(self, student: Actor | None, student_acts: NDArray[np.bool_]) -> None:
         self.student, self.student_acts = student, student_acts
-        self.teacher_action, self.inputs = torch.empty(0), torch.empty(0)
+        self.teacher_action = self.inputs = np.empty((0, 0), np.float32)
 
-    def __call__(self, values: dict[str, Tensor]) -> dict[str, Tensor]:
-        self.inputs = torch.cat([values["observation"], values["command"]], dim=-1)
+    def begin(self, frame: NDArray[np.float32]) -> None:
+        """Carry nothing."""
+
+    def __call__(
+        self, values: Mapping[str, NDArray[np.float32]], carried: None
+    ) -> tuple[dict[str, NDArray[np.float32]], None]:
+        self.inputs = np.concatenate([values["observation"], values["command"]], axis=-1)
         action = self.teacher_action
         if self.student:
-            action = torch.where(self.student_acts[:, None], self.student(self.inputs), action)
-        return {"action": action}
+            with torch.inference_mode():
+                mine = self.student(torch.from_numpy(self.inputs)).numpy()
+            action = np.where(self.student_acts[:, None], mine, action)
+        return {"action": action}, None
 
 
 class DaggerController:
@@ -95,7 +100,7 @@ class DaggerController:
         protocol: EvalProtocol,
         teacher: Controller,
         student: Actor | None,
-        student_acts: Tensor,
+        student_acts: NDArray[np.bool_],
     ) -> None:
         """Combine a teacher and a student.
 
@@ -127,10 +132,10 @@ class DaggerController:
     def act(self, obs: Observation, target: Target) -> JointCommand:
         """Act, and record the teacher's action wherever it is fit to be imitated."""
         wanted = self._robot.action_of(self._teacher.act(obs, target).q)
-        self._engine.teacher_action = torch.from_numpy(wanted.astype(np.float32))
+        self._engine.teacher_action = wanted.astype(np.float32)
         command = self._student.act(obs, target)
         kept = obs.active & (np.abs(wanted[:, :NUM_LEG_JOINTS]) < MAX_LEG_ACTION).all(axis=1)
-        inputs = self._engine.inputs.numpy()[kept]
+        inputs = self._engine.inputs[kept]
         self.recorded.append(ImitationDataset(inputs, wanted[kept].astype(np.float32)))
         return command
 
@@ -193,7 +198,7 @@ def _record_shard(
         student.load_state_dict(student_state)
     rng = stream(seed, "lessons", number)
     robot, rows = load_robot(protocol.robot), sample_manifest(protocol, target_set, count, rng)
-    student_acts = torch.from_numpy(rng.random(count) < student_fraction)
+    student_acts = rng.random(count) < student_fraction
     controller = DaggerController(robot, protocol, load_controller(spec, robot), student, student_acts)
     for _ in ControlLoop(controller, protocol, rows).run():
         pass  # the controller records

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import mujoco.batch
 
-from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy import weights
 from wbc_baselines.learned.training.config import TrainConfig
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
@@ -64,7 +64,7 @@ def measure(
     from wbc_baselines.learned.training.trainer import Trainer, duration
 
     protocol, path = find_protocol(config.protocol)
-    available = checkpoint.available(protocol.robot.variant)
+    available = weights.available(protocol.robot.variant)
     ours = {m: name for m in methods if (name := f"{m}@{config.seed}") in available}
     rows = read_manifest(protocol, manifest_path(path))[0].of_replicate(0, episodes)
     control_steps = config.num_envs * config.num_steps_per_env

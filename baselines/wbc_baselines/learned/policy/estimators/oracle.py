@@ -1,13 +1,11 @@
 """The upper bound: the context is the true privileged vector, and nothing is estimated."""
 
 from wbc_baselines.learned.policy.estimators.base import Estimator
-from wbc_baselines.learned.policy.inputs import PAPER_PRIVILEGED, PRIVILEGED
+from wbc_baselines.learned.policy.inputs import PRIVILEGED
 
 
 class Oracle(Estimator):
     """The method whose context is the privileged vector, assembled by environment or controller."""
-
-    context_dims = (PAPER_PRIVILEGED, PRIVILEGED)  # of the first oracles, and since
 
     def __init__(self, context_dim: int = PRIVILEGED) -> None:
         super().__init__()

@@ -6,17 +6,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from wbc_baselines.learned.policy.architecture import (
+    FEED_FORWARD,
+    HEAD,
+    HEADS,
+    LAYERS,
+    MODEL,
+    sinusoids,
+)
 from wbc_baselines.learned.policy.inputs import HISTORY, HISTORY_FRAME
-
-# Source: SPIRAL-EDWIN/JC_umi-on-tron @f83d62e; no dropout
-MODEL, LAYERS, HEADS, FEED_FORWARD = 128, 2, 8, 512
-HEAD = MODEL // HEADS
-
-
-def sinusoids(length: int, size: int) -> Tensor:
-    """Compute positional encodings (length, size). Source: Vaswani et al. 2017, section 3.5."""
-    angle = torch.arange(length)[:, None] * torch.exp(torch.arange(0, size, 2) * (-math.log(1e4) / size))
-    return torch.stack([angle.sin(), angle.cos()], dim=-1).flatten(1)
 
 
 class Layer(nn.Module):
@@ -73,7 +71,7 @@ class WindowEncoder(nn.Module):
     def __init__(self, size: int) -> None:
         super().__init__()
         self.embed = nn.Linear(HISTORY_FRAME, MODEL)
-        self.register_buffer("positions", sinusoids(HISTORY, MODEL), persistent=False)
+        self.register_buffer("positions", torch.from_numpy(sinusoids(HISTORY, MODEL)), persistent=False)
         self.layers = nn.ModuleList(Layer() for _ in range(LAYERS))
         self.read_out = nn.Linear(MODEL, size)
 
