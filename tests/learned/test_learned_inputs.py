@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from wbc_baselines.learned.policy import inputs, poses, reference
+from wbc_baselines.learned.policy import inputs, reference
 from wbc_baselines.learned.policy.normalizer import FLOOR, Normalizer
+from wbc_baselines.learned.training import poses
+from wbc_baselines.learned.training.history import History
+from wbc_baselines.learned.training.rewards import gate
 from wbc_bench.cli.main import main
 from wbc_bench.rotations import geodesic_angle, matrix_from_rotvec, rho6
 
@@ -61,7 +64,7 @@ def test_wrong_width_is_refused():
 
 def test_window_keeps_the_last_ten_and_refills_on_reset():
     terms = [torch.full((2, 57), float(k)) for k in range(13)]
-    history = inputs.History(terms[0])
+    history = History(terms[0])
     assert (history.window == 0).all()
     for term in terms[1:12]:
         history.push(term)
@@ -79,7 +82,7 @@ def test_reference_by_hand():
     for _ in range(10):
         d_ref = reference.advance(d_ref, 1.4, 0.02)
     torch.testing.assert_close(d_ref, torch.tensor([0.92, 0.0]))  # 1.2 - 10 * 0.028; never below zero
-    found = reference.gate(torch.tensor([1.0, 1.2, 0.0]))
+    found = gate(torch.tensor([1.0, 1.2, 0.0]))
     torch.testing.assert_close(found, torch.tensor([0.5, 0.7310586, 0.0066929]))  # sigmoid of 0, 1, -5
 
 

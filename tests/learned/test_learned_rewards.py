@@ -9,7 +9,6 @@ torch = pytest.importorskip("torch")
 from torch import Tensor
 
 from wbc_baselines.learned.policy.methods import Reward
-from wbc_baselines.learned.policy.reference import gate
 from wbc_baselines.learned.training import rewards as r
 from wbc_baselines.learned.training.resets import DECAY
 from wbc_baselines.learned.training.target_set import read_target_set
@@ -222,7 +221,7 @@ def test_mean_gate():
         exact, abs=1e-3
     )
     assert float(r.mean_gate(torch.tensor(0.0), torch.tensor(1.0), 10.0)) == pytest.approx(
-        float(gate(torch.zeros(())))
+        float(r.gate(torch.zeros(())))
     )
 
 

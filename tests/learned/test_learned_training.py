@@ -24,7 +24,6 @@ from trainers import STEPS, TINY, assert_equal, trainer
 from training_targets import TARGETS, manifest_of
 from wbc_baselines.learned.policy import checkpoint
 from wbc_baselines.learned.policy.estimators.latent import LatentEstimator
-from wbc_baselines.learned.policy.inputs import History
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.training import run_folder as runs
 from wbc_baselines.learned.training.backends import cpu
@@ -34,6 +33,7 @@ from wbc_baselines.learned.training.cli import main
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_baselines.learned.training.curves import curves_figure, measured_scores, smooth, write_curves
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment
+from wbc_baselines.learned.training.history import History
 from wbc_baselines.learned.training.make import make_environment
 from wbc_baselines.learned.training.precision import fast_products
 from wbc_baselines.learned.training.resets import sample_episodes

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from wbc_bench.controller import (
     COMMAND_PARTS,
@@ -83,6 +84,7 @@ class ControlLoop:
             )
         self._controller, self._protocol, self._rows = controller, protocol, rows
         self._randomness = GlobalRandomness(int(rows.noise_key[0]))
+        self._threads = ThreadpoolController()
         self.simulation = Simulation(protocol, rows, scene)
         self.sensors = Sensors(protocol, rows, controller.info.signals)
         self.push_step = np.full(rows.push_time.shape, -1)  # (N, P) the protocol's steps, -1 for none
@@ -210,14 +212,17 @@ class ControlLoop:
 
     @contextmanager
     def blamed(self, method: str) -> Iterator[None]:
-        """Where a method of the controller runs; see `isolation.blamed`. Undeclared signals are named."""
+        """Where a method of the controller runs; see `isolation.blamed`. Undeclared signals are named.
+
+        Its matrix products take one thread: several may round differently, and wait for each other busily.
+        """
         episodes = self._rows.episode
         doing = (
             f"controller '{self._controller.info.name}' failed in `{method}` at control step {self.step} "
             f"of episodes {episodes.min()} to {episodes.max()}"
         )
         try:
-            with blamed(doing, self._randomness):
+            with self._threads.limit(limits=1, user_api="blas"), blamed(doing, self._randomness):
                 yield
         except ControllerError as error:
             cause, declared = error.__cause__, self._controller.info.signals

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from wbc_bench.controller import Controller
 from wbc_bench.episodes.manifest import EpisodeManifest
@@ -18,8 +17,6 @@ from wbc_bench.rotations import geodesic_angle, matrix_from_wxyz
 LOADED = 30.0  # [N] on a sole, a tenth of the robot's weight: it stands and does not just touch
 
 
-# several threads may round the product of two matrices differently, and wait for each other busily
-@threadpool_limits.wrap(limits=1, user_api="blas")
 def rollout(
     controller: Controller,
     protocol: EvalProtocol,

@@ -22,7 +22,7 @@ from wbc_bench.policies.onnx_network import OnnxNetwork
 from wbc_bench.policies.terms import Seen
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import JOINT_NAMES, NUM_JOINTS, Robot, RobotConfig, mount_of, tcp_of
-from wbc_bench.rotations import geodesic_angle, matrix_from_rpy
+from wbc_bench.rotations import geodesic_angle, matrix_from_rho6, matrix_from_rpy
 
 Array = NDArray[np.float64]
 REFERENCE_DECAY = 1.0  # [1/s] where no protocol says otherwise
@@ -158,7 +158,7 @@ class CardController:
         columns = ee_rot[:, :, :2]
         if obs.ee_pose is not None:
             measured = obs.ee_pose.rot6_b
-            ee_rot = _orthonormal(measured)
+            ee_rot = matrix_from_rho6(measured)
             ee_pos = obs.ee_pose.pos_b + ee_rot @ self._tool_pos
             turned = not np.array_equal(self._tool_rot, np.eye(3))
             columns = (ee_rot @ self._tool_rot)[:, :, :2] if turned else _columns(measured)
@@ -204,11 +204,3 @@ def _tool(robot: Robot, name: str) -> tuple[Array, Array]:
 def _columns(rot6: Array) -> Array:
     """(N, 3, 2) of two columns (N, 6)."""
     return np.swapaxes(rot6.reshape(-1, 2, 3), 1, 2)
-
-
-def _orthonormal(rot6: Array) -> Array:
-    """Rotations (N, 3, 3) of two noisy columns (N, 6). Source: Zhou et al. 2019, eq. 15."""
-    x = rot6[:, :3] / np.linalg.norm(rot6[:, :3], axis=1, keepdims=True)
-    y = rot6[:, 3:] - (x * rot6[:, 3:]).sum(axis=1, keepdims=True) * x
-    y /= np.linalg.norm(y, axis=1, keepdims=True)
-    return np.stack([x, y, np.cross(x, y)], axis=2)

@@ -8,7 +8,7 @@ diffusion_policy/common/pose_repr_util.py (pose_rep "relative").
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.rotations import rho6
+from wbc_bench.rotations import matrix_from_rho6, rho6
 from wbc_bench.sources.adapters import EE_FROM_UMI_TCP
 from wbc_bench.sources.slew import Pose
 
@@ -43,9 +43,5 @@ def numbers(pose: Pose) -> Array:
 
 
 def pose_of(values: Array) -> Pose:
-    """Poses of (..., 9) whose six numbers need not be orthonormal. Source: Zhou et al. 2019, eq. 15."""
-    first, second = values[..., 3:6], values[..., 6:9]
-    x = first / np.linalg.norm(first, axis=-1, keepdims=True)
-    y = second - (x * second).sum(axis=-1, keepdims=True) * x
-    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
-    return Pose(values[..., :3], np.stack([x, y, np.cross(x, y)], axis=-2))
+    """Poses of (..., 9) whose six numbers need not be orthonormal."""
+    return Pose(values[..., :3], np.swapaxes(matrix_from_rho6(values[..., 3:]), -1, -2))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from wbc_baselines.learned.policy.card import PolicyCard
-from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, _output, seal
+from wbc_baselines.learned.policy.onnx_engine import CARD, OPSET, output_name, seal
 from wbc_baselines.learned.policy.policy import Policy
 from wbc_bench.files import write_atomic
 
@@ -51,8 +51,8 @@ def write_onnx(path: Path, policy: Policy, card: PolicyCard) -> None:
             str(raw),
             input_names=list(flow.inputs),
             # an output cannot have the name of an input
-            output_names=[_output(name) for name in flow.outputs],
-            dynamic_axes={name: {0: "batch"} for name in (*flow.inputs, *map(_output, flow.outputs))},
+            output_names=[output_name(name) for name in flow.outputs],
+            dynamic_axes={name: {0: "batch"} for name in (*flow.inputs, *map(output_name, flow.outputs))},
             opset_version=OPSET,
             dynamo=False,
         )

@@ -132,9 +132,9 @@ class _WindowEncoder:
         all_of = np.concatenate([np.eye(MODEL), first["qkv.weight"].astype(np.float64)])
         bias = np.concatenate([np.zeros(MODEL), first["qkv.bias"].astype(np.float64)])
         scale = np.repeat([1.0, HEAD**-0.5, 1.0, 1.0], MODEL)
-        places = sinusoids(HISTORY, MODEL) + tensors["embed.bias"].astype(np.float64)
+        positions = sinusoids(HISTORY, MODEL) + tensors["embed.bias"].astype(np.float64)
         self._of_frame = (scale[:, None] * (all_of @ tensors["embed.weight"])).astype(np.float32)
-        self._of_place = (scale * (places @ all_of.T + bias)).astype(np.float32)
+        self._of_position = (scale * (positions @ all_of.T + bias)).astype(np.float32)
         self._first, self._last = _Layer(first), _Layer(last)
         self._read_out = _Linear(_part(tensors, "read_out"))
 
@@ -143,7 +143,7 @@ class _WindowEncoder:
 
     def __call__(self, frame: Array, carried: Array) -> tuple[Array, Array]:
         carried = np.concatenate([carried[:, 1:], (frame @ self._of_frame.T)[:, None]], axis=1)
-        token, *projected = np.split(carried + self._of_place, 4, axis=-1)
+        token, *projected = np.split(carried + self._of_position, 4, axis=-1)
         x = self._first.finish(token, _attend(*projected))
         return self._read_out(self._last.finish(x[:, -1], self._last.attend_last(x))), carried
 
@@ -200,7 +200,9 @@ class _Normalizer:
         self._mean, self._deviation = tensors["mean"], tensors["std"] + np.float32(FLOOR)
 
     def __call__(self, x: Array) -> Array:
-        return (x - self._mean) / self._deviation
+        x = x - self._mean
+        x /= self._deviation
+        return x
 
 
 class _Linear:
@@ -263,7 +265,8 @@ def _exponentials(scores: Array) -> tuple[Array, Array]:
 
 
 def _sigmoid(x: Array) -> Array:
-    return np.float32(0.5) * (np.tanh(np.float32(0.5) * x) + 1)
+    half = np.float32(0.5)
+    return half + half * np.tanh(half * x)
 
 
 def _part(tensors: Tensors, name: str) -> dict[str, Array]:

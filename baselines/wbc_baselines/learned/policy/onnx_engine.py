@@ -55,7 +55,7 @@ class OnnxEngine:
         if found != wanted:
             raise CheckpointError(f"'{path}' reads {found}, valid for {self.card.method}: {wanted}")
         names, outputs = [value.name for value in self._session.get_outputs()], list(self.flow.outputs)
-        if names != [_output(name) for name in outputs]:
+        if names != [output_name(name) for name in outputs]:
             raise CheckpointError(f"'{path}' writes {names}, valid for {self.card.method}: {outputs}")
 
     def begin(self, frame: Array) -> dict[str, Array]:
@@ -73,7 +73,7 @@ class OnnxEngine:
         """See `controller.Engine`."""
         given = {**values, **carried}
         arrays = {name: np.ascontiguousarray(given[name]) for name in self.flow.inputs}
-        results = self._session.run([_output(name) for name in self.flow.outputs], arrays)
+        results = self._session.run([output_name(name) for name in self.flow.outputs], arrays)
         found = {name: np.asarray(value) for name, value in zip(self.flow.outputs, results, strict=True)}
         return found, {name: found.pop(name) for name in carried}
 
@@ -113,5 +113,5 @@ def check_seal(data: bytes, path: Path) -> None:
     )
 
 
-def _output(name: str) -> str:
+def output_name(name: str) -> str:
     return name if name == "action" else f"next_{name}"

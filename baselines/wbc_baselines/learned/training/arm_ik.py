@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wbc_baselines.learned.policy.poses import rotation_from_rho6, twice_sine
+from wbc_baselines.learned.training.poses import rotation_from_rho6, twice_sine
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 
 ROTATION_WEIGHT = 0.3  # [m/rad] weight of the orientation relative to the position; choice

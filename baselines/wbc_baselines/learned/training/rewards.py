@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from wbc_baselines.learned.policy.methods import Reward
-from wbc_baselines.learned.policy.reference import gate
 from wbc_bench.robot import NUM_LEG_JOINTS
 
 SIGMA_P2 = 0.5  # [m] sigma_p^2
@@ -20,6 +19,8 @@ SIGMA_PROG = 0.5  # [m] and [rad]
 SIGMA_S2 = 0.5  # sigma_s^2
 OFFSET = 0.4  # c_s. Source: paper, eq. 7
 DEAD_ZONE = 0.5  # gamma of e_ref, in the unit of d_ref
+GATE_SLOPE = 5.0  # k of the phase
+GATE_CENTRE = 1.0  # mu of the phase, in the unit of d_ref
 MIN_SEPARATION = 0.14  # [m] d_min; choice: a third less than the default 0.21 m, five sole widths
 
 # Tolerances tau_j of the safety quantities
@@ -114,6 +115,14 @@ ADDITIVE = Gates(
     progress=SCORE_L * (0.25 + 0.75 * PHASE),
     phase=PHASE,
 )
+
+
+def gate(d_ref: Tensor) -> Tensor:
+    """Compute the phase g (N,), near 1 while approaching and near 0 at the target.
+
+    Source: paper, eq. rfm_phase.
+    """
+    return torch.sigmoid(GATE_SLOPE * (d_ref - GATE_CENTRE))
 
 
 def mean_gate(d_start: Tensor, decay: Tensor, horizon: float, steps: int = 500) -> Tensor:

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from wbc_baselines.learned.policy import inputs
-from wbc_baselines.learned.policy.poses import pose_errors, twice_sine
 from wbc_baselines.learned.training.backends.base import State
+from wbc_baselines.learned.training.poses import pose_errors, twice_sine
 from wbc_bench.outcomes import STRATA
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS
 

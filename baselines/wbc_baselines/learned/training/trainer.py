@@ -19,7 +19,6 @@ from torch import Tensor
 from wbc_baselines.learned.policy import checkpoint
 from wbc_baselines.learned.policy.card import new_card
 from wbc_baselines.learned.policy.estimators import make_estimator
-from wbc_baselines.learned.policy.inputs import History
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.policy.networks import Actor
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
@@ -31,6 +30,7 @@ from wbc_baselines.learned.training.distillation import (
 )
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS, Environment, Step
 from wbc_baselines.learned.training.estimator_rollout import EstimatorRollout
+from wbc_baselines.learned.training.history import History
 from wbc_baselines.learned.training.ppo import ScheduledPPO
 from wbc_baselines.learned.training.precision import fast_products
 from wbc_bench.episodes.protocol import find_protocol
