@@ -1,12 +1,13 @@
-"""`wbc-bench list`, `export` and `bench`: what is installed, and what can be done with it."""
+"""`wbc-bench list` and `export`: what is installed, and a controller as a file."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.conf import FlagCreatePairsOff
 
+from wbc_bench.cli.benchmarks import BENCHMARKS
 from wbc_bench.cli.common import NO_RECORDS, RESULTS, print_table
 from wbc_bench.errors import UnknownNameError
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from wbc_bench.results.table import Table
 
 SHOWN = ("ablation_v2", "ablation_v1")  # protocols whose successes stand beside the controllers
-BENCHMARKS = "wbc_bench.benchmarks"  # entry points: name -> a callable that returns a DataFrame
 INPUTS = "wbc_bench.inputs"  # entry points: name -> a callable: rows (vector, columns, size, term, unit)
 
 
@@ -257,39 +257,3 @@ class ExportController:
             for name in made:
                 (folder / name).replace(path.with_name(name))
         print(path)
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Time what the installed packages offer to be timed, e.g. the solvers of the IK controller."""
-
-    names: Positional[tuple[str, ...]] = ()
-    """Names of the benchmarks to run, see `wbc-bench list`; all of them when not given."""
-    out: Path | None = None
-    """Folder to write <name>.csv and <name>.md to; nothing is written when not given."""
-
-    def run(self) -> None:
-        from importlib.metadata import entry_points
-
-        from wbc_bench.files import ensure_writable, made_whole
-        from wbc_bench.isolation import blamed
-        from wbc_bench.results.table import Table
-
-        found = {point.name: point for point in entry_points(group=BENCHMARKS)}
-        for name in self.names:
-            if name not in found:
-                raise UnknownNameError("benchmark", name, found, f"entry points of '{BENCHMARKS}'")
-        if self.out:
-            ensure_writable(self.out)
-        for name in self.names or sorted(found):
-            with blamed(f"benchmark '{name}' failed"):
-                frame = found[name].load()()
-                cells = [
-                    tuple(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row) for row in frame.values
-                ]
-                header = tuple(map(str, frame.columns))
-            table = Table(name, f"Benchmark {name}", header, tuple(cells), data=frame)
-            print_table(table)
-            if self.out:
-                with made_whole(self.out) as (made, _):
-                    table.write(made)

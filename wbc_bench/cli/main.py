@@ -12,11 +12,12 @@ from typing import Annotated, get_args
 import tyro
 from tyro.conf import subcommand
 
+from wbc_bench.cli.benchmarks import Bench
 from wbc_bench.cli.board import Board, Submit
 from wbc_bench.cli.common import THREADS, run_command
 from wbc_bench.cli.doors import DemoEval, DemoRecord, DemoTrain
 from wbc_bench.cli.evaluate import Ablation, Eval, Reach, Stress
-from wbc_bench.cli.lists import Bench, ExportController, List
+from wbc_bench.cli.lists import ExportController, List
 from wbc_bench.cli.policy import PolicyCheck, PolicyImport, PolicyTerms
 from wbc_bench.cli.protocol import Freeze, Reveal, Show, Verify
 from wbc_bench.cli.replay import ExportDataset, Film, Replay
