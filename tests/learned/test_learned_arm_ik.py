@@ -13,7 +13,7 @@ from wbc_baselines.learned.training.arm_ik import (
     rotation_about,
     rotation_vector,
 )
-from wbc_bench.robot import NUM_LEG_JOINTS, load_robot
+from wbc_bench.robot import NUM_LEG_JOINTS, RobotConfig, load_robot
 
 ROBOT = load_robot()
 ARM = ArmKinematics(ROBOT)
@@ -65,6 +65,27 @@ def test_holding_torque_is_mujocos_bias_at_rest():
         down = torch.tensor(-data.xmat[1].reshape(3, 3)[2], dtype=torch.float32)
         torque = ARM.holding_torque(q[None], down[None])
         np.testing.assert_allclose(torque[0], data.qfrc_bias[-6:], atol=1e-3)
+
+
+@pytest.mark.parametrize("robot", [ROBOT, load_robot(RobotConfig(variant="paper"))])
+def test_holding_torque_carries_a_payload(robot):
+    """Its difference to that of an empty hand is what a weight at the place asks of the joints."""
+    arm, model = ArmKinematics(robot), robot.model()
+    data = mujoco.MjData(model)
+    place, mass = np.array([0.05, -0.02, 0.03]), 1.5
+    tcp = model.site("tcp").id
+    link = int(model.site_bodyid[tcp])
+    for q in postures(20):
+        data.qpos[:7] = [0.3, -0.2, 0.9, *np.array([0.8, 0.1, -0.5, 0.3]) / np.sqrt(0.99)]
+        data.qpos[-6:] = q
+        mujoco.mj_forward(model, data)
+        point = data.site_xpos[tcp] + data.xmat[link].reshape(3, 3) @ place
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jac(model, data, jacobian, None, point, link)
+        down = torch.tensor(-data.xmat[1].reshape(3, 3)[2], dtype=torch.float32)[None]
+        load = torch.tensor([[mass]]), torch.tensor(place, dtype=torch.float32)[None]
+        torque = arm.holding_torque(q[None], down, *load) - arm.holding_torque(q[None], down)
+        np.testing.assert_allclose(torque[0], 9.81 * mass * jacobian[2, -6:], atol=1e-3)
 
 
 def test_it_finds_poses_near_the_default_and_stays_inside_the_limits():

@@ -15,6 +15,10 @@ from wbc_baselines.learned.training import run_folder as runs
 from wbc_baselines.learned.training.config import TrainingError
 from wbc_baselines.learned.training.distillation import (
     DEPARTURE_REFERENCE,
+    ENCODERS,
+    GAINS,
+    PAYLOAD,
+    PLACE,
     SAMPLE_FRACTION,
     TARGET_STEP,
     ArmIKLoss,
@@ -166,7 +170,14 @@ def test_the_arm_sets_out_as_the_reference_falls_and_bears_its_weight():
     critic = observations["critic"]
     scale, kp = ROBOT.action_scale[8:], ROBOT.kp[8:]
     q = ROBOT.default_q[8:] + critic[:, 14:20].numpy()
-    weight = distillation._arm.holding_torque(torch.tensor(q).float(), critic[:, 3:6]).numpy() / kp
+    hidden = critic[:, PRIVILEGED_COLUMNS]
+    generator = torch.Generator().manual_seed(0)
+    factors, errors = (0.2 * torch.rand(2, len(critic), 14, generator=generator) - 0.1).unbind()
+    payload, place = torch.rand(len(critic), 1, generator=generator), torch.full((len(critic), 3), 0.02)
+    hidden[:, GAINS], hidden[:, ENCODERS] = 1 + factors, errors
+    hidden[:, PAYLOAD], hidden[:, PLACE] = payload, place
+    torque = distillation._arm.holding_torque(torch.tensor(q).float(), critic[:, 3:6], payload, place)
+    weight = torque.numpy() / (kp * (1 + factors[:, 8:].numpy())) + errors[:, 8:].numpy()
     critic[:, REFERENCE] = DEPARTURE_REFERENCE
     np.testing.assert_allclose(distillation.actions(observations)[0], weight / scale, atol=1e-5)
     critic[:, REFERENCE] = ARRIVAL_REFERENCE

@@ -40,6 +40,7 @@ class ArmKinematics:
         self._cross = torch.stack([cross_matrix(axis) for axis in self._axis])
         self._one = torch.eye(3, device=device)
         self._pos, self._rot = tensor(data.site_xpos[tcp]), tensor(data.site_xmat[tcp].reshape(3, 3))
+        self._link = tensor(data.xmat[model.site_bodyid[tcp]].reshape(3, 3))
         self._mass, self._com = (tensor(x) for x in _lumps(model, data, first))
         self._lower = tensor(robot.lower[NUM_LEG_JOINTS:]) + MARGIN
         self._upper = tensor(robot.upper[NUM_LEG_JOINTS:]) - MARGIN
@@ -64,12 +65,16 @@ class ArmKinematics:
         _, _, rot, shift = self._chain(q)
         return rot[-1] @ self._pos + shift[-1], rot[-1] @ self._rot
 
-    def holding_torque(self, q: Tensor, gravity_b: Tensor) -> Tensor:
-        """Compute the torques that hold the arm at rest.
+    def holding_torque(
+        self, q: Tensor, gravity_b: Tensor, payload: Tensor | None = None, place: Tensor | None = None
+    ) -> Tensor:
+        """Compute the torques that hold the arm and a payload at rest.
 
         Args:
             q: (N, 6) [rad] Arm joints.
             gravity_b: (N, 3) Unit vector that points down, base frame.
+            payload: (N, 1) [kg] Mass in the hand; None for an empty one.
+            place: (N, 3) [m] Where it is from the hand, in the frame of the hand's link.
 
         Returns:
             Torques (N, 6) [N m].
@@ -80,6 +85,10 @@ class ArmKinematics:
             arm = (rot[k] @ com + shift[k])[:, None] - anchor[:, : k + 1]
             weight = (GRAVITY * mass * gravity_b)[:, None]
             torque[:, : k + 1] -= (torch.linalg.cross(arm, weight.expand_as(arm)) * axis[:, : k + 1]).sum(-1)
+        if payload is not None and place is not None:
+            point = rot[-1] @ self._pos + shift[-1] + ((rot[-1] @ self._link) @ place[..., None])[..., 0]
+            arm, weight = point[:, None] - anchor, (GRAVITY * payload * gravity_b)[:, None]
+            torque -= (torch.linalg.cross(arm, weight.expand_as(arm)) * axis).sum(-1)
         return torque
 
     def _chain(self, q: Tensor) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:

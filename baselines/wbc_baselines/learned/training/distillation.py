@@ -18,7 +18,13 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from wbc_baselines.learned.policy.checkpoint import Checkpoint
-from wbc_baselines.learned.policy.inputs import COMMAND, OBSERVATION, OBSERVATION_LAYOUT, columns
+from wbc_baselines.learned.policy.inputs import (
+    COMMAND,
+    OBSERVATION,
+    OBSERVATION_LAYOUT,
+    PRIVILEGED_LAYOUT,
+    columns,
+)
 from wbc_baselines.learned.training.arm_ik import ArmKinematics
 from wbc_baselines.learned.training.dagger import HUBER_DELTA
 from wbc_baselines.learned.training.environment import PRIVILEGED_COLUMNS
@@ -39,6 +45,11 @@ DEPARTURE_REFERENCE = 2.0  # task-progress reference below which the arm leaves 
 LEGS, ARM = slice(NUM_LEG_JOINTS), slice(NUM_LEG_JOINTS, NUM_JOINTS)
 GRAVITY, JOINT_POS, REFERENCE = (
     columns(OBSERVATION_LAYOUT, term) for term in ("projected gravity", "joint positions", "task-progress")
+)
+
+GAINS, PAYLOAD, PLACE, ENCODERS = (
+    columns(PRIVILEGED_LAYOUT, term)
+    for term in ("kp factors", "payload", "place of the payload", "errors of the encoders")
 )
 
 
@@ -153,7 +164,9 @@ class ArmIKLoss:
     """Imitation of the arm's inverse kinematics by the arm joints; the leg actions stay as they are.
 
     The target moves from the default posture to the inverse-kinematics solution while the task-progress
-    reference falls, and contains the deflection that holds the arm's weight.
+    reference falls. It contains the deflection that holds the weight of arm and payload with the gains of the
+    episode, and the errors of its encoders: a kilogram in the hand of the paper's arm turns its wrist by more
+    than 10 degrees.
     """
 
     def __init__(self, robot: Robot, actor: MLPModel, action_scale: Tensor) -> None:
@@ -175,19 +188,22 @@ class ArmIKLoss:
     def actions(self, observations: TensorDict) -> tuple[Tensor, Tensor]:
         """Return the arm's target actions (M, 6), and whether (M,) the arm reaches the target."""
         seen = observations["critic"]  # without noise
+        hidden = seen[:, PRIVILEGED_COLUMNS]
         q, command = self._default + seen[:, JOINT_POS][:, ARM], seen[:, OBSERVATION:][:, :COMMAND]
         solution = self._arm.solve(q, command)
         error = torch.linalg.vector_norm(self._arm.hand(solution)[0] - command[:, :3], dim=-1)  # [m]
         progress = (DEPARTURE_REFERENCE - seen[:, REFERENCE]) / (DEPARTURE_REFERENCE - ARRIVAL_REFERENCE)
-        deflection = self._arm.holding_torque(q, seen[:, GRAVITY]) / self._kp  # [rad]
-        wanted = progress.clamp(0, 1) * (solution - self._default) + deflection
+        torque = self._arm.holding_torque(q, seen[:, GRAVITY], hidden[:, PAYLOAD], hidden[:, PLACE])
+        deflection = torque / (self._kp * hidden[:, GAINS][:, ARM])  # [rad]
+        wanted = progress.clamp(0, 1) * (solution - self._default) + deflection + hidden[:, ENCODERS][:, ARM]
         return wanted / self._scale, error < REACHED
 
-    def update(self, observations: TensorDict) -> dict[str, float]:
+    def update(self, observations: TensorDict, pace: float = 1.0) -> dict[str, float]:
         """Move the arm's actions toward the targets, in a sample of the states of a rollout (T, N).
 
         Args:
             observations: Observation groups of a rollout (T, N).
+            pace: Factor on the learning rate, see `TrainConfig.pace`.
 
         Returns:
             The root mean square difference [rad] before the update, by name; empty if no target is in reach.
@@ -200,7 +216,7 @@ class ArmIKLoss:
         wanted = self.supervised.means(flat)
         difference = self._scale * (target - wanted[:, ARM])
         wanted[:, ARM] += TARGET_STEP * (target - wanted[:, ARM])
-        self.supervised.update(flat, wanted, AUXILIARY_LEARNING_RATE, epochs=1)
+        self.supervised.update(flat, wanted, pace * AUXILIARY_LEARNING_RATE, epochs=1)
         return {"arm_ik": float(difference.square().mean().sqrt())}
 
 
@@ -220,11 +236,12 @@ class PostureLoss:
         """
         self.supervised, self._scale = SupervisedUpdate(actor, action_scale), action_scale[LEGS]
 
-    def update(self, observations: TensorDict) -> dict[str, float]:
+    def update(self, observations: TensorDict, pace: float = 1.0) -> dict[str, float]:
         """Move the leg actions toward the postures, wherever `leg_posture_error` is not zero.
 
         Args:
             observations: Observation groups of a rollout (T, N).
+            pace: Factor on the learning rate, see `TrainConfig.pace`.
 
         Returns:
             The root mean square posture error [rad] by name; empty where there is none.
@@ -236,5 +253,5 @@ class PostureLoss:
         error = flat["leg_posture_error"]
         wanted = self.supervised.means(flat)
         wanted[:, LEGS] += LEG_TARGET_STEP * error / self._scale
-        self.supervised.update(flat, wanted, LEG_LEARNING_RATE, epochs=1)
+        self.supervised.update(flat, wanted, pace * LEG_LEARNING_RATE, epochs=1)
         return {"posture": float(error.square().mean().sqrt())}

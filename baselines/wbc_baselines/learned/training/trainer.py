@@ -209,7 +209,7 @@ class Trainer:
         for name, loss in self.auxiliary_losses.items():
             begin, end = getattr(config, name)
             if begin <= self.samples < end:
-                losses |= loss.update(states)
+                losses |= loss.update(states, config.pace(self.samples))
         return losses
 
     def update_estimator(self, rollout: EstimatorRollout) -> dict[str, float]:
