@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from wbc_baselines.ik.clearance import Clearance
 from wbc_baselines.ik.config import Weights
+from wbc_baselines.ik.controller import PERIOD
 from wbc_baselines.ik.model import ARM_LINKS, BODY_LINKS, Pose, WholeBodyModel
 from wbc_baselines.ik.stance import half_planes
 from wbc_bench.robot import JOINT_NAMES, Robot
 from wbc_bench.rotations import wxyz_from_matrix
 
 Array = NDArray[np.float64]
-PERIOD = 0.02  # [s]
 POSITION_AND_PITCH = [0, 1, 2, 4]  # of a foot's twist in its own frame
 QP_SOLVERS = ("daqp", "quadprog", "proxqp", "osqp")  # for Pink and mink: the fastest here first
 

@@ -103,7 +103,8 @@ def plan_goal_posture(
         wanted = np.tile(chosen, (len(open_rows), 1))
         part = start.take(rows), hand.take(rows), target.take(rows), stance.take(rows), hull.take(rows)
         joints, error = _walk(solver, kinematics, *part, wanted, weight)
-        joints, error = joints.reshape(*(shape := (len(open_rows), len(chosen))), -1), error.reshape(shape)
+        error = error.reshape(len(open_rows), len(chosen))
+        joints = joints.reshape(*error.shape, -1)
         arrived = error < ARRIVED
         pick = np.where(arrived.any(axis=1), arrived.argmax(axis=1), error.argmin(axis=1))
         each = np.arange(len(open_rows))

@@ -15,12 +15,13 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from wbc_baselines.ik.config import TUNED
+from wbc_baselines.ik.controller import PERIOD
 from wbc_baselines.ik.daqp_ik import DaqpIK
 from wbc_baselines.ik.geometry import Pose as Poses
 from wbc_baselines.ik.kinematics import Configuration, Kinematics
 from wbc_baselines.ik.model import Pose, WholeBodyModel, configuration
 from wbc_baselines.ik.osqp_ik import OsqpIK
-from wbc_baselines.ik.peers import PERIOD, BenchProblem, Solver, make_mink, make_pink
+from wbc_baselines.ik.peers import BenchProblem, Solver, make_mink, make_pink
 from wbc_baselines.ik.placo_ik import PlacoIK
 from wbc_baselines.ik.reference import SLEW
 from wbc_baselines.ik.stance import Hull, Stance, base_from_stance, measured_stance
@@ -85,6 +86,7 @@ def solve_times(targets: int, steps: int) -> pd.DataFrame:
     sole. A package that is not installed is a row that says so.
     """
     problem = _problem()
+    model, batched = WholeBodyModel(problem.robot), DaqpIK(problem.robot, problem.weights, PERIOD)
     solvers, rows = {}, {}
     for name, make in MAKERS.items():
         try:
@@ -96,8 +98,8 @@ def solve_times(targets: int, steps: int) -> pd.DataFrame:
     together: list[Walk] = []
     for goal in [goals[0], *goals]:
         for name, solver in solvers.items():
-            walks[name].append(_walk(problem, solver, goal, steps))
-        together += _walk_together(problem, goals, steps)
+            walks[name].append(_walk(problem, model, solver, goal, steps))
+        together += _walk_together(problem, model, batched, goals, steps)
     # the first warmed up
     walks[BATCHED] = together[len(goals) :]
     rows[BATCHED] = _row(BATCHED, f"daqp, {len(goals)} at once", walks[BATCHED])
@@ -107,8 +109,7 @@ def solve_times(targets: int, steps: int) -> pd.DataFrame:
     return pd.DataFrame([rows[name] for name in (BATCHED, *MAKERS)])
 
 
-def _walk(problem: BenchProblem, solver: Solver, goal: Pose, steps: int) -> Walk:
-    model = WholeBodyModel(problem.robot)
+def _walk(problem: BenchProblem, model: WholeBodyModel, solver: Solver, goal: Pose, steps: int) -> Walk:
     start = model.ee_of(problem.q)
     turning = pin.log3(start[1].T @ goal[1])
     q, times, failed = solver.start(problem.q), [], 0
@@ -125,10 +126,11 @@ def _walk(problem: BenchProblem, solver: Solver, goal: Pose, steps: int) -> Walk
     return Walk(times, failed, _errors(model, solver.to_pinocchio(q), goal, problem.soles))
 
 
-def _walk_together(problem: BenchProblem, goals: list[Pose], steps: int) -> list[Walk]:
+def _walk_together(
+    problem: BenchProblem, model: WholeBodyModel, solver: DaqpIK, goals: list[Pose], steps: int
+) -> list[Walk]:
     """The same ways with the batched solver, which is at all targets in each step."""
-    model, count = WholeBodyModel(problem.robot), len(goals)
-    solver = DaqpIK(problem.robot, problem.weights, PERIOD)
+    count = len(goals)
     start = model.ee_of(problem.q)
     pos, rot = np.array([goal[0] for goal in goals]), np.array([goal[1] for goal in goals])
     turning = np.array([pin.log3(start[1].T @ turned) for turned in rot])
