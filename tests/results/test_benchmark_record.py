@@ -55,8 +55,8 @@ def test_numbers_are_divided_row_by_row() -> None:
 
 @pytest.fixture
 def one_benchmark(monkeypatch) -> None:
-    point = metadata.EntryPoint("mine", "test_benchmark:frame", "wbc_bench.benchmarks")
-    other = metadata.EntryPoint("other", "test_benchmark:frame", "wbc_bench.benchmarks")
+    point = metadata.EntryPoint("mine", "test_benchmark_record:frame", "wbc_bench.benchmarks")
+    other = metadata.EntryPoint("other", "test_benchmark_record:frame", "wbc_bench.benchmarks")
     monkeypatch.setattr(metadata, "entry_points", lambda group: [point, other])
 
 
