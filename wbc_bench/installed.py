@@ -1,5 +1,6 @@
 """Which controllers are installed, without loading any of them."""
 
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 ENTRY_POINTS = "wbc_bench.controllers"
@@ -10,6 +11,7 @@ OWN = (
 )
 
 
+@cache
 def controllers() -> dict[str, EntryPoint]:
     """Installed controllers by name."""
     return {point.name: point for point in (*OWN, *entry_points(group=ENTRY_POINTS))}

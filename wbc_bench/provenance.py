@@ -136,12 +136,13 @@ def software(controller: object) -> Software:
     if callable(own):
         with blamed(f"controller '{type(controller).__name__}' failed in `digest`"):
             _add(digest, "digest()", str(own()).encode())
-    return Software(_harness(), digest.hexdigest())
+    return Software(digest_of_code(ROOT), digest.hexdigest())
 
 
-def _harness() -> str:
+def digest_of_code(module: str, *more: Path) -> str:
+    """SHA-256 of a module of the harness, what it imports from it, more of its files, and versions."""
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
-    for path in sources(ROOT):
+    for path in (*sources(module), *more):
         _add(digest, path.relative_to(PACKAGE).as_posix(), path.read_bytes())
     return digest.hexdigest()
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -20,6 +21,7 @@ from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
+from wbc_bench.results.kept import NOTE, KeptParts
 from wbc_bench.results.margins import analyse
 from wbc_bench.results.store import ResultStore
 from wbc_bench.results.stress import read_stress
@@ -35,7 +37,8 @@ def publish(
 ) -> list[Path]:
     """Write `<out>/tables`, `<out>/figures` and `<out>/report.html`; equal records give equal bytes.
 
-    They are made in a folder of their own and moved when all of them are there.
+    They are made in a folder of their own and moved when all of them are there. What follows from the same
+    records and code as the files of the last report in the folder is taken from it.
 
     Args:
         store: The records.
@@ -74,19 +77,30 @@ def publish(
     specs |= {climb.spec for stress in ladders for climb in stress.climbs}
     colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
     with made_whole(out) as (made, paths):
+        kept = KeptParts(out, made, __name__)
         for protocol, methods in evaluated.items():
-            own = studies_of(protocol, known_studies)
-            _write_protocol(protocol, released.get(protocol), methods, made, beside, own, colours)
+            own, shown = studies_of(protocol, known_studies), {spec: colours[spec] for spec in methods}
+            records = [(method.spec, method.name, method.records) for method in methods.values()]
+            kept.part(
+                f"protocol {protocol}",
+                (records, released.get(protocol), beside, own, shown),
+                partial(_write_protocol, protocol, released.get(protocol), methods, beside, own, shown),
+            )
         write_sealed_tables(evaluated, made / "tables")
-        _write_tracks(tracks, made, labels, colours)
+        kept.part(
+            "tracks",
+            ([track.record for track in tracks], labels, colours),
+            partial(_write_tracks, tracks, labels, colours),
+        )
         _write_doors(doors, made, labels)
         for stress in ladders:
             found = analyse(stress)
             write_stress_tables(stress, found, made / "tables")
             write_stress_figure(stress, found, made / "figures", colours)
+        kept.write()
         protocol_of = {study.name: study.protocol for study in known_studies}
         report.write(evaluated, made, out, protocol_of, ladders, os.path.relpath(store.root, out))
-    return paths
+    return [path for path in paths if path.name != NOTE]
 
 
 def publish_tracks(root: Path, out: Path) -> list[Path]:
@@ -95,7 +109,7 @@ def publish_tracks(root: Path, out: Path) -> list[Path]:
     Raises: StoreError when a track cannot be read or the folder cannot be written.
     """
     with made_whole(out) as (made, paths):
-        _write_tracks(read_tracks(root), made, labels_of(released_rows()))
+        _write_tracks(read_tracks(root), labels_of(released_rows()), None, made)
     return paths
 
 
@@ -125,10 +139,10 @@ def _write_protocol(
     name: str,
     released: EvalProtocol | None,
     methods: Mapping[str, Evaluated],
-    out: Path,
     beside: Sequence[str],
     studies: Sequence[Study],
     colours: Mapping[str, str],
+    out: Path,
 ) -> None:
     for study in studies:
         if released and isinstance(released.targets, ReachTargets):
@@ -144,7 +158,7 @@ def _write_protocol(
 
 
 def _write_tracks(
-    tracks: list[Track], out: Path, labels: Mapping[str, str], colours: Mapping[str, str] | None = None
+    tracks: list[Track], labels: Mapping[str, str], colours: Mapping[str, str] | None, out: Path
 ) -> None:
     if tracks:
         tracking_table(tracks, labels).write(out / "tables")

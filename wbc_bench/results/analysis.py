@@ -264,7 +264,11 @@ def by_height(episodes: pd.DataFrame) -> list[tuple[float, pd.DataFrame]]:
     """(height [m], its episodes), lowest first."""
     # Rounded to 1 mm: heights are a grid of centimetres that went through floating point.
     height = column(episodes, "height").round(3)
-    return [(float(h), subset(episodes, height == h)) for h in np.unique(height)]
+    order = np.argsort(height, kind="stable")
+    ordered = episodes.take(order)  # once; the parts are then slices of it
+    heights, starts = np.unique(height[order], return_index=True)
+    ends = [*starts[1:], len(ordered)]
+    return [(float(h), ordered.iloc[a:b]) for h, a, b in zip(heights, starts, ends, strict=True)]
 
 
 def contiguous_range(heights: Sequence[float], good: Sequence[bool]) -> HeightRange:

@@ -5,7 +5,9 @@ from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any
 
-from matplotlib import style
+from matplotlib import rcParams, style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import hsv_to_rgb, to_hex
 from matplotlib.figure import Figure
 
@@ -65,9 +67,12 @@ def save(figure: Figure, name: str, out_dir: Path | str) -> list[Path]:
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     png, svg = folder / f"{name}.png", folder / f"{name}.svg"
-    figure.savefig(png, metadata={"Software": None})
+    # `savefig` draws each file twice, the first time for its size alone: the canvases draw once
+    figure.dpi = rcParams["savefig.dpi"]
+    figure.patch.set_facecolor(rcParams["savefig.facecolor"])
+    FigureCanvasAgg(figure).print_png(png, metadata={"Software": None})
     figure.set_layout_engine("none")  # laid out by now; both files look the same
-    figure.savefig(svg, metadata={"Date": None, "Creator": None})
+    FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None, "Creator": None})
     return [png, svg]
 
 
