@@ -289,6 +289,17 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
     )
 
 
+@pytest.mark.parametrize("start", [0.0, 5e6])
+def test_auxiliary_losses_keep_pace_with_the_noise_wherever_a_run_starts(start):
+    """A run that begins at little noise has the rates that a long one has when its noise has fallen to that."""
+    fallen = replace(TINY, std_legs=((start, 0.27), (10e6, 0.09)))
+    little = replace(TINY, std_legs=((0.0, 0.09),))
+    assert fallen.pace(0) == 1.0 and fallen.pace(10_000_000) == pytest.approx(
+        little.pace(0)
+    ) == pytest.approx(1 / 3)
+    assert replace(TINY, std_legs=((0.0, 0.4),)).pace(0) == 1.0  # never beyond the rates that were found
+
+
 # ---- files -----------------------------------------------------------------------------------------------
 
 

@@ -49,7 +49,7 @@ class Compare:
 
 @dataclass(frozen=True)
 class Report:
-    """Make tables, figures and report.html from the records, as far as those changed; nothing is evaluated."""
+    """Make tables, figures and report.html from the records, as far as they changed; nothing is evaluated."""
 
     results: Path = RESULTS
     """Folder to read the records from."""

@@ -9,6 +9,7 @@ from typing import Literal
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.errors import BenchError, UnknownNameError
 
+EXPLORING = 0.27  # [1] noise of the legs at which the rates of the auxiliary losses were found
 ESTIMATOR_UPDATES = 4  # per iteration, where the estimator has as many environments
 FREE = frozenset({"budget", "threads"})  # settings that may differ when a run is resumed
 # Control steps and value of each knot; geometric between knots, constant before the first and after the last
@@ -156,13 +157,13 @@ class TrainConfig:
         return value_at(self.std_legs, samples), value_at(self.std_arm, samples)
 
     def pace(self, samples: int) -> float:
-        """Factor on the learning rates of the auxiliary losses: the noise of the legs over that at the start.
+        """Factor on the learning rates of the auxiliary losses: the noise of the legs over EXPLORING, at most 1.
 
         PPO moves the policy by a part of the noise, whatever the losses beside it do. With rates that stayed,
         falls rose from 8 to 40 % while the noise fell from 0.27 to 0.08, and came down within a million
         control steps after the losses had ended, see docs/training-log.md.
         """
-        return value_at(self.std_legs, samples) / value_at(self.std_legs, 0)
+        return min(1.0, value_at(self.std_legs, samples) / EXPLORING)
 
     def disturbance_scale(self, samples: int) -> float:
         """Scale in [0, 1] of noise, pushes and randomization."""
