@@ -291,7 +291,7 @@ def test_the_evaluation_takes_the_same_actions(method, tmp_path):
 
 @pytest.mark.parametrize("start", [0.0, 5e6])
 def test_auxiliary_losses_keep_pace_with_the_noise_wherever_a_run_starts(start):
-    """A run that begins at little noise has the rates that a long one has when its noise has fallen to that."""
+    """A run that begins at little noise has the rates of a long one whose noise has fallen to it."""
     fallen = replace(TINY, std_legs=((start, 0.27), (10e6, 0.09)))
     little = replace(TINY, std_legs=((0.0, 0.09),))
     assert fallen.pace(0) == 1.0 and fallen.pace(10_000_000) == pytest.approx(

@@ -157,7 +157,7 @@ class TrainConfig:
         return value_at(self.std_legs, samples), value_at(self.std_arm, samples)
 
     def pace(self, samples: int) -> float:
-        """Factor on the learning rates of the auxiliary losses: the noise of the legs over EXPLORING, at most 1.
+        """Factor on the rates of the auxiliary losses: the noise of the legs over EXPLORING, at most 1.
 
         PPO moves the policy by a part of the noise, whatever the losses beside it do. With rates that stayed,
         falls rose from 8 to 40 % while the noise fell from 0.27 to 0.08, and came down within a million
