@@ -63,7 +63,12 @@ def commit() -> Commit:
 
 
 def versions() -> dict[str, str]:
-    """Installed versions of Python, the harness, and every package that it or its extras ask for."""
+    """Installed versions of Python, the harness, and every package of it or its extras, at first use."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     wanted = {"wbc-bench"}
     for requirement in metadata.requires("wbc-bench") or ():
         match = re.match(r"[\w.-]+", requirement)

@@ -1,16 +1,16 @@
 """Intervals and paired tests. Randomness comes in as a generator; empty input raises, undefined is NaN."""
 
 import math
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import bdtr, ndtri  # scipy.stats holds the same and takes seconds to import
 
 FloatArray = NDArray[np.float64]
 
 CONFIDENCE = 0.95
-Z = float(ndtri((1.0 + CONFIDENCE) / 2.0))  # 1.96 standard deviations
+Z = NormalDist().inv_cdf((1.0 + CONFIDENCE) / 2.0)  # 1.96 standard deviations
 RESAMPLES = 5000  # the Monte-Carlo error of a 2.5 % tail is then 0.2 %
 CHUNK_VALUES = 2_000_000  # resampled values held at once: 16 MB
 
@@ -136,6 +136,8 @@ def mcnemar_exact(a: ArrayLike, b: ArrayLike) -> PairedTest:
         raise ValueError(f"paired outcomes differ in length: {len(x)} and {len(y)}")
     only_a, only_b = int((x & ~y).sum()), int((~x & y).sum())
     discordant = only_a + only_b
+    from scipy.special import bdtr  # here: half of the time until a first episode was SciPy's import
+
     # Binomial(n, 1/2) is symmetric: both tails are twice the one below the smaller count.
     p_value = min(1.0, 2.0 * float(bdtr(min(only_a, only_b), discordant, 0.5))) if discordant else 1.0
     return PairedTest(only_a, only_b, p_value)
