@@ -20,7 +20,7 @@ class Bench:
     out: Path | None = None
     """Folder to write <name>.json, .csv, .md and .tex to; nothing is written when not given."""
     against: Path | None = None
-    """<name>.json of an earlier build, to whose numbers those of this one are divided."""
+    """Record of an earlier build, a <name>.json, by whose numbers those of this one are divided."""
 
     def run(self) -> None:
         from importlib.metadata import entry_points
