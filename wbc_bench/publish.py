@@ -1,5 +1,6 @@
 """Everything that follows from the records: tables, figures and report, of every protocol that has a run."""
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -7,9 +8,16 @@ from pathlib import Path
 
 import pandas as pd
 
+from wbc_bench.episodes.conditions import conditions_of
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest
-from wbc_bench.episodes.protocol import EvalProtocol, ReachTargets, load_protocol, protocol_names
-from wbc_bench.errors import StoreError, UnknownNameError
+from wbc_bench.episodes.protocol import (
+    EvalProtocol,
+    ReachTargets,
+    find_protocol,
+    load_protocol,
+    protocol_names,
+)
+from wbc_bench.errors import BenchError, StoreError, UnknownNameError
 from wbc_bench.files import PROTOCOLS, made_whole
 from wbc_bench.results import report
 from wbc_bench.results.analysis import Evaluated, collect_all
@@ -21,6 +29,7 @@ from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.figures.targets import write_targets
 from wbc_bench.results.figures.tracking import write_tracking
 from wbc_bench.results.figures.workspace import write_workspace
+from wbc_bench.results.gallery import Told
 from wbc_bench.results.kept import NOTE, KeptParts
 from wbc_bench.results.margins import analyse
 from wbc_bench.results.store import ResultStore
@@ -99,7 +108,8 @@ def publish(
             write_stress_figure(stress, found, made / "figures", colours)
         kept.write()
         protocol_of = {study.name: study.protocol for study in known_studies}
-        report.write(evaluated, made, out, protocol_of, ladders, os.path.relpath(store.root, out))
+        told = _told(store, evaluated)
+        report.write(evaluated, made, out, protocol_of, ladders, os.path.relpath(store.root, out), told)
     return [path for path in paths if path.name != NOTE]
 
 
@@ -127,6 +137,25 @@ def _place(name: str, released: Mapping[str, EvalProtocol]) -> tuple[bool, str]:
     """Order of the protocols in a report: the released ones of the paper's robot lead."""
     leads = name in released and released[name].robot != RobotConfig()
     return not leads, name
+
+
+def told_by(manifest: EpisodeManifest) -> Told:
+    """What says of an episode of a manifest what disturbs it."""
+    row_of = {key: row for row, key in enumerate(zip(manifest.replicate, manifest.episode, strict=True))}
+    return lambda replicate, episode: ", ".join(conditions_of(manifest, row_of[replicate, episode]))
+
+
+def _told(store: ResultStore, evaluated: Mapping[str, Mapping[str, Evaluated]]) -> dict[str, Told]:
+    """Protocol -> what says how its episodes are disturbed, where the manifest of its records is here."""
+    found = {}
+    for name, methods in evaluated.items():
+        path = PROTOCOLS / f"{name}.toml" if name in protocol_names() else store.protocol_path(name)
+        with contextlib.suppress(BenchError):  # it only tells more; `replay` says what is wrong with it
+            manifest, digest = read_manifest(find_protocol(str(path))[0], manifest_path(path), False)
+            records = [record for method in methods.values() for record in method.records]
+            if all(record.manifest_sha256 == digest for record in records):
+                found[name] = told_by(manifest)
+    return found
 
 
 def target_frame(manifest: EpisodeManifest) -> pd.DataFrame:

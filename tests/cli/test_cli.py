@@ -439,6 +439,21 @@ def test_protocol_show(capsys, tiny, tmp_path):
     assert list((tmp_path / "pictures").glob("tiny_targets.*"))
 
 
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        ("--grid 3 -o a.mp4", "--grid '3': valid: COLUMNSxROWS of 1 to 5 each"),
+        ("--grid 0x2 -o a.mp4", "--grid '0x2': valid: COLUMNSxROWS"),
+        ("--grid 9x9 -o a.mp4", "--grid '9x9': valid: COLUMNSxROWS"),
+        ("--grid 2x2 --strip a.png", "--grid makes a film"),
+    ],
+)
+def test_a_grid_that_cannot_be_filmed_is_one_line(tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    assert message in fails(capsys, "film", "run", "--episode", 0, *words.split())
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("words", ["robot show", "film run --episode 0 --strip x.png"])
 def test_a_missing_library_to_draw_with_is_one_line(tmp_path, words):
     """MuJoCo loads it when it is imported, and fails with a traceback of its own."""

@@ -1,12 +1,17 @@
 """The gallery: which episodes are worst, by hand, and where their replays are."""
 
+import html
 import re
 
 import numpy as np
 import pytest
 
 from synthetic import frame_of, methods_in, record, study_store
+from wbc_bench.episodes.conditions import conditions_of
+from wbc_bench.episodes.manifest import manifest_path, read_manifest
+from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.outcomes import Outcome, SuccessRule
+from wbc_bench.publish import told_by
 from wbc_bench.results import analysis, gallery
 
 RULE = SuccessRule()
@@ -63,3 +68,14 @@ def test_a_command_leads_to_records_that_stand_elsewhere(tmp_path):
     frame = frame_of(0, np.array(["fell"]))
     text = gallery.gallery_html("p", method(frame), tmp_path, "../my records")
     assert "--results &#x27;../my records&#x27; -o replays/p/a-b" in text
+
+
+def test_of_known_episodes_the_disturbances_are_told(tmp_path):
+    protocol, path = find_protocol("deploy_v1")
+    drawn, _ = read_manifest(protocol, manifest_path(path))
+    frame = frame_of(0, np.array(["fell"] * 3))
+    text = gallery.gallery_html("deploy_v1", method(frame), tmp_path, ".", told_by(drawn))
+    rows = drawn.of_replicate(0)
+    for row in range(3):
+        assert html.escape(", ".join(conditions_of(rows, row))) in text
+    assert text.count('class="drawn"') == 3

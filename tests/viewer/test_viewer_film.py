@@ -1,5 +1,6 @@
 """A film and a strip show the episode that was recorded, on machines that can draw."""
 
+import dataclasses
 import subprocess
 from pathlib import Path
 
@@ -71,6 +72,32 @@ def test_a_film_has_a_picture_every_other_step(again: Rerun, strip: film.Pixels,
     assert frames == -(-len(again.moments) // film.EVERY) == len(seen)
     assert seconds == pytest.approx(frames / 25, abs=0.05)
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
+
+
+def test_a_grid_shows_each_episode_at_its_place_until_all_have_ended(
+    again: Rerun, strip: film.Pixels, tmp_path: Path
+) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    short = dataclasses.replace(again, moments=again.moments[:9])
+    path, (width, height) = tmp_path / "grid.mp4", film.CELL
+    film.write_grid_of([again, short, short], 2, path)
+    frames, _ = ffmpeg.count_frames_and_secs(str(path))
+    assert frames == -(-len(again.moments) // film.EVERY)
+    reader = ffmpeg.read_frames(str(path), pix_fmt="rgb24")
+    assert next(reader)["size"] == (2 * width, 2 * height)
+    pictures = [
+        np.frombuffer(data, np.uint8).reshape(2 * height, 2 * width, 3).astype(int) for data in reader
+    ]
+    first, last = pictures[0], pictures[-1]
+
+    def cell(picture: np.ndarray, row: int, column: int) -> np.ndarray:
+        return picture[row * height :, column * width :][:height, :width]
+
+    assert cell(last, 1, 1).min() > 240  # of 255: nothing is there
+    # the picture is compressed: equal views are near, others are not
+    assert np.abs(cell(last, 0, 1) - cell(last, 1, 0)).mean() < 2
+    assert np.abs(cell(last, 0, 0) - cell(first, 0, 0)).mean() > 4
+    assert np.abs(cell(last, 0, 1) - cell(pictures[6], 0, 1)).mean() < 2  # it has ended
 
 
 @pytest.mark.parametrize("what", ["film", "strip", "picture"])

@@ -1,5 +1,6 @@
 """`wbc-bench replay`, `film` and `export-dataset`: episodes of a stored run again."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,9 @@ from wbc_bench.cli.common import RESULTS, UsageError, drawing, open_records
 
 if TYPE_CHECKING:
     from wbc_bench.results.store import Run
+
+
+LARGEST_GRID = 5  # columns or rows: each episode has a renderer of its own, and is 400 pixels wide
 
 
 @dataclass(frozen=True)
@@ -73,12 +77,15 @@ class Film(_Again):
     times: tuple[float, ...] | None = None
     """Times since the start of the episode of the strip's pictures [s]; six, evenly over the episode, when
     not given."""
+    grid: str | None = None
+    """Columns and rows of a film of several episodes side by side, e.g. 3x3; they are --episode and those
+    that follow it in the replicate. One episode alone when not given."""
 
     def run(self) -> None:
         drawing()
         from wbc_bench.files import ensure_file_writable, write_atomic
         from wbc_bench.progress import Progress
-        from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of
+        from wbc_bench.viewer.film import strip_caption, strip_of, write_film_of, write_grid_of
         from wbc_bench.viewer.picture import write_png
         from wbc_bench.viewer.rerun import rerun
 
@@ -89,19 +96,39 @@ class Film(_Again):
                 raise UsageError(f"'{path}': valid: a file that ends in {suffix}")
             if path:
                 ensure_file_writable(path)
+        columns, rows = _grid_of(self.grid)
+        if self.grid and (self.strip or not self.out):
+            raise UsageError("--grid makes a film: give -o FILE.mp4, and no --strip")
         run = self._find()
-        with Progress("steps") as progress:
-            again = rerun(run, self.episode, self.protocol, progress.update, self.controller)
-        print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}")
+        seen = []
+        for episode in range(self.episode, self.episode + columns * rows):
+            with Progress("steps") as progress:
+                seen.append(rerun(run, episode, self.protocol, progress.update, self.controller))
+            print(f"{seen[-1].title}: {seen[-1].stored['outcome']}\n{seen[-1].verdict}")
+        again = seen[0]
         if self.out:
             with Progress("pictures") as progress:
-                write_film_of(again, self.out, progress.update)
+                if self.grid:
+                    write_grid_of(seen, columns, self.out, progress.update)
+                else:
+                    write_film_of(again, self.out, progress.update)
             print(self.out)
         if self.strip:
             pixels = strip_of(again, self.times)
             write_png(pixels, self.strip)
             write_atomic(self.strip.with_suffix(".txt"), strip_caption(again, self.times).encode())
             print(self.strip)
+
+
+def _grid_of(text: str | None) -> tuple[int, int]:
+    """Columns and rows. Raises: UsageError."""
+    if text is None:
+        return 1, 1
+    found = re.fullmatch(r"(\d)x(\d)", text, re.ASCII)
+    columns, rows = map(int, found.groups()) if found else (0, 0)
+    if not (1 <= columns <= LARGEST_GRID and 1 <= rows <= LARGEST_GRID):
+        raise UsageError(f"--grid '{text}': valid: COLUMNSxROWS of 1 to {LARGEST_GRID} each, e.g. 3x3")
+    return columns, rows
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import html
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from wbc_bench.results.analysis import (
 )
 from wbc_bench.results.formatting import CM, DEG, number_text, window_text
 
+Told = Callable[[int, int], str]  # replicate, episode -> what disturbed it
 SHOWN = 10  # episodes an outcome
 REPLAYED = (
     " Run a command in the folder of this report; the page it writes is linked here by the next "
@@ -71,10 +73,17 @@ def replay_command(
     return f"wbc-bench replay {run} --episode {episode} --results {shlex.quote(records)} -o {page}{code}"
 
 
-def gallery_html(protocol: str, method: Evaluated, beside: Path, records: str = ".") -> str:
+def gallery_html(
+    protocol: str,
+    method: Evaluated,
+    beside: Path,
+    records: str = ".",
+    told: Told | None = None,
+) -> str:
     """One table, folded away: a group of rows per outcome.
 
     A replay that stands in `beside` is a link; `records` leads from there to the folder of the records.
+    `told` says what disturbed an episode; None where it is not known.
     """
     episodes = method.episodes
     kinds = [name for name in ("condition", "orientation") if any(episodes[name])]
@@ -103,11 +112,15 @@ def gallery_html(protocol: str, method: Evaluated, beside: Path, records: str = 
             )
             text = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
             text += "".join(f'<td class="number">{value}</td>' for value in values)
+            if told is not None:
+                text += f'<td class="drawn">{html.escape(told(*where[2:]))}</td>'
             text += f"<td>{_replay(where, beside, records, resolved[where[2]])}</td>"
             rows.append(f'<tr class="group">{text}</tr>' if k == 0 else f"<tr>{text}</tr>")
     head = "".join(f"<th>{name}</th>" for name in texts)
     head += (
-        "".join(f'<th class="number">{name}</th>' for name in (*numbers, "Ended at (s)")) + "<th>Replay</th>"
+        "".join(f'<th class="number">{name}</th>' for name in (*numbers, "Ended at (s)"))
+        + ("<th>Disturbances</th>" if told is not None else "")
+        + "<th>Replay</th>"
     )
     return (
         f"<details><summary>Worst episodes of {html.escape(method.name)}</summary>\n"

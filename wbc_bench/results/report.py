@@ -57,6 +57,7 @@ figcaption { font-size: 12.5px; color: #555; max-width: 960px; }
 details { margin: 20px 0 0; }
 summary { cursor: pointer; font-weight: 600; margin: 0 0 6px; }
 .gallery td:last-child { white-space: normal; min-width: 430px; line-height: 1.25; }
+.gallery td.drawn { white-space: normal; min-width: 260px; line-height: 1.25; }
 .gallery code { font-size: 10.5px; color: #555; user-select: all; }
 .tag { color: #b34a00; font-weight: 600; }
 """
@@ -163,13 +164,14 @@ def write(
     studies: Mapping[str, str] | None = None,
     ladders: Sequence[Stress] = (),
     records_at: str = ".",
+    told: Mapping[str, gallery.Told] | None = None,
 ) -> Path:
     """Writes `<results_dir>/report.html` from its tables/*.md, its figures and the runs (`collect_all`).
 
     Replays and figures that are not made of records are looked for in `beside`, the folder where the report
     will stand; `results_dir` when not given. `studies` maps the name of a study to its protocol; `ladders`
     are severity ladders, whose tables and figures form a section each; `records_at` leads from the report's
-    folder to that of the records.
+    folder to that of the records; `told` says for a protocol what disturbed its episodes.
 
     Raises: StoreError, runs that must not be mixed, or a figure's caption that cannot be read.
     """
@@ -202,7 +204,8 @@ def write(
         if protocol in protocols:
             parts.append(f'<p class="rule">{code_html(gallery.order_text(rule) + gallery.REPLAYED)}</p>\n')
             methods = evaluated[protocol].values()
-            parts += [gallery.gallery_html(protocol, method, beside, records_at) for method in methods]
+            said = (told or {}).get(protocol)
+            parts += [gallery.gallery_html(protocol, method, beside, records_at, said) for method in methods]
         if parts:
             sections.append((protocol or "More", "".join(parts)))
     for prefix, title in GIVEN_SECTIONS:

@@ -1,5 +1,6 @@
 """An episode as a film or as a strip of pictures, drawn without a window: `wbc-bench film`."""
 
+import contextlib
 from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
@@ -16,15 +17,18 @@ from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.viewer.moment import Moment, Skeleton, force_arrows, push_arrow
 from wbc_bench.viewer.picture import Canvas, add_axes, add_bones, add_connector
 from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress
+from wbc_bench.viewer.time_line import Event, events_of, story_of
 
 Pixels = NDArray[np.uint8]
-SIZE, PANEL = (640, 480), (300, 400)  # [px] width, height of a film, of a picture in a strip
+# [px] width, height of a film, of an episode in a grid, of a picture in a strip
+SIZE, CELL, PANEL = (640, 480), (400, 304), (300, 400)
 PANELS, GAP = 6, 4  # pictures in a strip; [px] between them
 INSIDE, OUTSIDE = (0.14, 0.59, 0.35, 0.4), (0.89, 0.50, 0.12, 0.4)  # of the tolerance, around the target
 TRAIL, FORCE, PUSH = (0.16, 0.39, 0.78, 1.0), (0.17, 0.59, 0.59, 1.0), (0.82, 0.20, 0.43, 1.0)
 SUPPORT, COM = (0.35, 0.67, 0.90, 1.0), (0.09, 0.14, 0.25, 1.0)
 TRAIL_PIECES = 50  # at most, evenly over the past
-INK = (27, 35, 48)
+INK, LINE, FAULT = (27, 35, 48), (184, 190, 198), (176, 58, 30)
+TOLD = 3  # events, the last ones, in words
 AZIMUTH, ELEVATION = 218.0, -14.0  # [deg]
 MARGIN = 0.22  # [m] around what must be seen: half the width of a part, and the labels
 
@@ -34,37 +38,75 @@ def write_film_of(again: Rerun, path: Path, progress: ShowProgress | None = None
 
     Raises: BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
     """
+    _write_film([(again, again.title, TOLD)], 1, SIZE, path, progress)
+
+
+def write_grid_of(
+    seen: Sequence[Rerun], columns: int, path: Path, progress: ShowProgress | None = None
+) -> None:
+    """Write episodes side by side as one MP4, row by row; one that has ended stands still.
+
+    Raises: BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
+    """
+    titles = [f"episode {again.episode}: {again.stored['outcome']}".replace("_", " ") for again in seen]
+    _write_film(
+        [(again, title, 1) for again, title in zip(seen, titles, strict=True)], columns, CELL, path, progress
+    )
+
+
+def _write_film(
+    shown: Sequence[tuple[Rerun, str, int]],
+    columns: int,
+    size: tuple[int, int],
+    path: Path,
+    progress: ShowProgress | None,
+) -> None:
+    """Film episodes, each with its title and the number of its last events to tell, `size` pixels each."""
     try:
         from imageio_ffmpeg import count_frames_and_secs, write_frames
     except ImportError as error:
         raise BenchError(missing_extra("a film", "film", error)) from error
     part = temporary(path)
-    rate = 1 / (EVERY * again.protocol.control_period)  # [1/s]
-    shown = range(0, len(again.moments), EVERY)
+    rate = 1 / (EVERY * shown[0][0].protocol.control_period)  # [1/s]
+    count = max(len(range(0, len(again.moments), EVERY)) for again, *_ in shown)
+    whole = columns * size[0], -(-len(shown) // columns) * size[1]
     try:
-        with Camera(again, SIZE) as camera:
+        with contextlib.ExitStack() as stack:
+            cameras = [stack.enter_context(Camera(again, size)) for again, *_ in shown]
             writer = write_frames(
                 str(part),
-                SIZE,  # pyright: ignore[reportArgumentType]
+                whole,  # pyright: ignore[reportArgumentType]
                 fps=rate,  # pyright: ignore[reportArgumentType]
                 quality=7,
                 ffmpeg_log_level="error",
                 output_params=["-f", "mp4"],
             )
             writer.send(None)
-            for number, k in enumerate(shown, 1):
-                writer.send(camera.picture(k, again.title))
+            for number in range(count):
+                pictures = [
+                    camera.picture(min(number * EVERY, len(again.moments) - 1), title, told)
+                    for camera, (again, title, told) in zip(cameras, shown, strict=True)
+                ]
+                writer.send(_tiled(pictures, columns))
                 if progress is not None:
-                    progress(number, len(shown), "filming")
+                    progress(number + 1, count, "filming")
             writer.close()
         # the encoder says nothing where its disk is full
-        if count_frames_and_secs(str(part))[0] != len(shown):
+        if count_frames_and_secs(str(part))[0] != count:
             raise OSError("the film was cut short: is the disk full?")
         part.replace(path)
     except (OSError, RuntimeError) as error:  # the second of a file that is no film
         raise StoreError(f"cannot write '{path}': {' '.join(str(error).split())[:200]}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def _tiled(pictures: list[Pixels], columns: int) -> Pixels:
+    """Equal pictures row by row; places that stay empty are white."""
+    empty = np.full_like(pictures[0], 255)
+    filled = pictures + [empty] * (-len(pictures) % columns)
+    rows = [np.concatenate(filled[k : k + columns], axis=1) for k in range(0, len(filled), columns)]
+    return np.ascontiguousarray(np.concatenate(rows))
 
 
 def strip_of(again: Rerun, times: Sequence[float] | None = None) -> Pixels:
@@ -84,7 +126,7 @@ def strip_caption(again: Rerun, times: Sequence[float] | None = None) -> str:
     outcome = str(again.stored["outcome"]).replace("_", " ")
     return (
         f"{again.title}: {outcome}. At {at} s; blue line: the way of the hand, sphere: the tolerance about "
-        "the target, green when the hand is inside it in position and orientation.\n"
+        f"the target, green when the hand is inside it in position and orientation. {story_of(again)}\n"
     )
 
 
@@ -114,6 +156,7 @@ class Camera:
         half = np.tan(np.deg2rad(model.vis.global_.fovy) / 2)  # [1] height at unit distance
         self._view = _view(again.moments, np.array([half * size[0] / size[1], half]))
         self._canvas = Canvas(model, *size)
+        self._events = events_of(again)
 
     def __enter__(self) -> "Camera":
         return self
@@ -121,8 +164,8 @@ class Camera:
     def __exit__(self, *_: object) -> None:
         self._canvas.__exit__()
 
-    def picture(self, k: int, title: str = "") -> Pixels:
-        """The k-th moment, and the way to it, in pixels (height, width, 3)."""
+    def picture(self, k: int, title: str = "", told: int = 0) -> Pixels:
+        """The k-th moment and the way to it in pixels (height, width, 3), the last `told` events in words."""
         moment, scene, skeleton = self._again.moments[k], self._scene, self._skeleton
         skeleton.place(moment)
         mujoco.mj_comPos(skeleton.model, skeleton.data)
@@ -138,7 +181,8 @@ class Camera:
         line = [m.ee_pos_w for m in past[:: -(-len(past) // TRAIL_PIECES)]] + [moment.ee_pos_w]
         for start, end in pairwise(line):
             add_connector(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.004, start, end, TRAIL)
-        return _label(self._canvas.draw(scene), moment, title)
+        picture = _label(self._canvas.draw(scene), moment, title)
+        return _with_time_line(picture, self._events, moment.time, told) if told else picture
 
     def _add_target(self, moment: Moment) -> None:
         success = self._again.protocol.success
@@ -197,6 +241,28 @@ def _label(pixels: Pixels, moment: Moment, title: str) -> Pixels:
     draw.text((10, picture.height - 24), f"{moment.time:.1f} s", INK, font)
     draw.text((picture.width - 10, picture.height - 24), errors, INK, font, anchor="ra")
     draw.text((10, 8), title, INK, font)
+    return np.asarray(picture)
+
+
+def _with_time_line(pixels: Pixels, events: Sequence[Event], now: float, told: int) -> Pixels:
+    """All events as marks on a line, faults in red, and the last `told` until `now` [s] in words."""
+    from PIL import Image, ImageDraw
+
+    picture = Image.fromarray(pixels)
+    draw = ImageDraw.Draw(picture)
+    left, right, line = 10, picture.width - 10, picture.height - 34
+
+    def place(time: float) -> float:
+        return left + (right - left) * min(time / max(events[-1].time, 1e-9), 1.0)
+
+    draw.line([(left, line), (right, line)], LINE, 2)
+    draw.line([(left, line), (place(now), line)], INK, 2)
+    for event in events:
+        x = place(event.time)
+        draw.line([(x, line - 5), (x, line + 5)], FAULT if event.wrong else INK, 3)
+    for row, event in enumerate([event for event in events if event.time <= now + 1e-9][-told:][::-1]):
+        y = line - 26 - 18 * row
+        draw.text((left, y), f"{event.time:.1f} s  {event.text}", FAULT if event.wrong else INK, _font())
     return np.asarray(picture)
 
 

@@ -94,6 +94,7 @@ class Canvas:
 
     def draw(self, scene: mujoco.MjvScene) -> NDArray[np.uint8]:
         """The scene in pixels (height, width, 3)."""
+        self._window.make_current()  # another canvas may have drawn since
         pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
         mujoco.mjr_render(self._viewport, scene, self._context)
         mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)

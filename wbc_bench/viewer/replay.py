@@ -11,6 +11,7 @@ from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.results.store import Run
 from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress, rerun
 from wbc_bench.viewer.scene import SceneView, serving
+from wbc_bench.viewer.time_line import events_of, story_of
 
 CHART = (370, 48)  # [px] width, height of the error chart
 
@@ -56,6 +57,7 @@ def _caption(again: Rerun) -> str:
     facts = [f"<b>{html.escape(again.title)}</b>", html.escape(ends)]
     if stored["stratum"]:
         facts.append(f"stratum {html.escape(str(stored['stratum']))}")
+    facts.append(html.escape(story_of(again)))
     style = "color:#1b7f4b" if not again.differences else "color:#a05a00"
     facts.append(f'<span style="{style}">{html.escape(again.verdict)}</span>')
     return (
@@ -82,5 +84,21 @@ def _chart(again: Rerun) -> str:
         names.append(f'<span style="color:{colour}">{name} 0–{most:.1f} {unit}</span>')
     return (
         f'<svg width="{CHART[0]}" height="{CHART[1] + 2}" style="display:block;margin-top:6px;'
-        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>error: {", ".join(names)}'
+        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>{_time_line(again)}error: {", ".join(names)}'
     )
+
+
+def _time_line(again: Rerun) -> str:
+    """What happened, as marks below the chart, on its axis of time, and in words."""
+    events, end = events_of(again), max(again.moments[-1].time, 1e-9)
+    colours = ["#b03a1e" if event.wrong else "#1b2330" for event in events]
+    places = [min(event.time / end * CHART[0], CHART[0] - 3) for event in events]
+    marks = "".join(
+        f'<rect x="{x:.1f}" width="3" height="10" fill="{colour}"/>'
+        for x, colour in zip(places, colours, strict=True)
+    )
+    words = "".join(
+        f'<div style="color:{colour}">{event.time:.2f} s {html.escape(event.text)}</div>'
+        for event, colour in zip(events, colours, strict=True)
+    )
+    return f'<svg width="{CHART[0]}" height="10" style="display:block">{marks}</svg>{words}'

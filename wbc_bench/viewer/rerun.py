@@ -38,6 +38,7 @@ class Rerun:
     episode: int  # number inside the replicate
     stored: Row  # of episodes.parquet
     again: Row  # what the rerun measured
+    drawn: EpisodeManifest  # (1) the episode's row
     moments: list[Moment]  # (T + 1) the start, and after every control step
 
     @property
@@ -125,7 +126,9 @@ def rerun(
     def of(part: slice) -> Rerun:
         row = place - part.start
         moments, table = _watched(spec, robot, protocol, rows.take(part), row, progress)
-        return Rerun(run, protocol, robot, episode, stored, table.slice(row, 1).to_pylist()[0], moments)
+        measured = table.slice(row, 1).to_pylist()[0]
+        drawn = rows.take(slice(place, place + 1))
+        return Rerun(run, protocol, robot, episode, stored, measured, drawn, moments)
 
     alone = of(slice(place, place + 1))
     elsewhere = record.machine.get("processor") != machine().get("processor")
