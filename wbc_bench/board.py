@@ -6,7 +6,7 @@ installed or that the caller names.
 
 import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -42,9 +42,8 @@ from wbc_bench.results.submission import (
 from wbc_bench.results.table import Table
 from wbc_bench.robot import load_robot
 from wbc_bench.viewer.replay import write_html
-from wbc_bench.viewer.rerun import rerun
+from wbc_bench.viewer.rerun import ShowProgress, rerun
 
-ShowProgress = Callable[[int, int, str], None]
 # an installed controller by names alone: with a path or an address, a record would choose what is read
 _SHIPPED = re.compile(r"\w+(:[\w@-]+)?", re.ASCII)
 _COLUMNS = ("stratum", "condition", "orientation")  # of episodes, as the manifest has them
@@ -277,7 +276,8 @@ def _write_replays(
                 if spec is not None and path is not None:
                     page = board / replay_path(protocol, submission.name, *row)
                     page.parent.mkdir(parents=True, exist_ok=True)
-                    write_html(Run(run.path, run.record), row[1], page, str(path), progress, spec)
+                    again = rerun(Run(run.path, run.record), row[1], str(path), progress, spec)
+                    write_html(again, page)
 
 
 def _size(known: Known) -> int | None:

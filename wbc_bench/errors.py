@@ -55,6 +55,7 @@ _PACKAGES = {  # distribution of a module that has another name
     "mujoco_warp": "mujoco-warp",
     "pink": "pin-pink",
     "pinocchio": "pin",
+    "rerun": "rerun-sdk",
     "rsl_rl": "rsl-rl-lib",
     "sklearn": "scikit-learn",
     "warp": "warp-lang",

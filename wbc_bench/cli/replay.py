@@ -47,21 +47,27 @@ class _Again(_Stored):
 
 @dataclass(frozen=True)
 class Replay(_Again):
-    """Run one episode of a stored run again, compare it with its record, and write it as a page to watch."""
+    """Run one episode of a stored run again, compare it with its record, and write it to be watched."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("replay.html")
-    """Path of the page to write, FILE.html; the page needs no network."""
+    """Path of the page to write, FILE.html, which needs no network; or FILE.rrd for a recording that the
+    viewer of Rerun opens."""
 
     def run(self) -> None:
         drawing()
         from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
         from wbc_bench.viewer.replay import write_html
+        from wbc_bench.viewer.rerun import rerun
+        from wbc_bench.viewer.rrd import write_rrd
 
+        if self.out.suffix not in (".html", ".rrd"):
+            raise UsageError(f"'{self.out}': valid: a file that ends in .html or .rrd")
         ensure_file_writable(self.out)
         run = self._find()
         with Progress("steps") as progress:
-            again = write_html(run, self.episode, self.out, self.protocol, progress.update, self.controller)
+            again = rerun(run, self.episode, self.protocol, progress.update, self.controller)
+        (write_html if self.out.suffix == ".html" else write_rrd)(again, self.out)
         print(f"{again.title}: {again.stored['outcome']}\n{again.verdict}\n{self.out}")
 
 

@@ -8,29 +8,19 @@ import numpy as np
 
 from wbc_bench.files import write_atomic
 from wbc_bench.results.formatting import CM, DEG
-from wbc_bench.results.store import Run
-from wbc_bench.viewer.rerun import EVERY, Rerun, ShowProgress, rerun
+from wbc_bench.viewer.rerun import EVERY, Rerun
 from wbc_bench.viewer.scene import SceneView, serving
 from wbc_bench.viewer.time_line import events_of, story_of
 
 CHART = (370, 48)  # [px] width, height of the error chart
 
 
-def write_html(
-    run: Run,
-    episode: int,
-    path: Path,
-    protocol_name: str | None = None,
-    progress: ShowProgress | None = None,
-    controller: str | None = None,
-) -> Rerun:
-    """Run an episode of a stored run again and write it as a page with time control.
+def write_html(again: Rerun, path: Path) -> None:
+    """Write an episode that has been run again as a page with time control.
 
-    Raises: see `rerun`; BenchError without viser; StoreError when the file cannot be written.
+    Raises: BenchError without viser; StoreError when the file cannot be written.
     """
-    again = rerun(run, episode, protocol_name, progress, controller)
     write_atomic(path, page(again).encode())
-    return again
 
 
 def page(again: Rerun) -> str:
