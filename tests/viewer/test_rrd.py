@@ -1,10 +1,12 @@
 """Recordings of Rerun and LeRobot datasets, read back by Rerun's own loaders."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from commands import fails
@@ -144,3 +146,39 @@ def test_a_dataset_is_read_by_another_loader_of_the_format(run: Run, tmp_path: P
         ):
             values = np.array(found[f"{entity} Scalars:scalars"])
             np.testing.assert_allclose(values[:, : len(wanted[0])], wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_a_filmed_dataset_has_a_picture_for_every_frame(run: Run, tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    try:
+        main(
+            ["export-dataset", str(run.path), "--episodes", "1", "0", "--video", "-o", str(tmp_path / "set")]
+        )
+    except SystemExit:
+        pytest.skip("no OpenGL to draw with")
+    name = "observation.images.scene"
+    film = tmp_path / "set" / f"videos/{name}/chunk-000/file-000.mp4"
+    lengths = [len(rerun(run, number).moments) for number in (1, 0)]
+    assert ffmpeg.count_frames_and_secs(str(film))[0] == sum(lengths)
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert info["features"][name]["shape"] == [240, 320, 3] and info["video_path"]
+    episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    ends = [row[f"videos/{name}/to_timestamp"] for row in episodes]
+    np.testing.assert_allclose(ends, np.cumsum(lengths) / 50)
+    assert [row[f"videos/{name}/from_timestamp"] for row in episodes] == [0.0, ends[0]]
+    # by a second reader of the film: the mean colour of what was filmed is that of the statistics
+    pictures = np.stack(
+        [
+            np.frombuffer(data, np.uint8).reshape(240, 320, 3)
+            for data in list(ffmpeg.read_frames(str(film), pix_fmt="rgb24"))[1:]
+        ]
+    )
+    stats = json.loads((tmp_path / "set/meta/stats.json").read_text())[name]
+    mean = np.reshape(stats["mean"], 3)
+    np.testing.assert_allclose(pictures.mean(axis=(0, 1, 2)) / 255, mean, atol=0.01)
+    assert np.shape(stats["q50"]) == (3, 1, 1) and np.shape(episodes[0][f"stats/{name}/std"]) == (3, 1, 1)
+    reader = experimental.LeRobotReader(tmp_path / "set")
+    for k, length in enumerate(lengths):
+        found = columns_of(reader.stream(k))
+        samples = found[next(key for key in found if "VideoStream:sample" in key)]
+        assert len(samples) == length and all(len(sample[0]) > 50 for sample in samples)

@@ -139,10 +139,12 @@ def _grid_of(text: str | None) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class ExportDataset(_Stored):
-    """Run episodes of a stored run again and write them as a LeRobot dataset (version 3, no pictures)."""
+    """Run episodes of a stored run again and write them as a LeRobot dataset (version 3)."""
 
     episodes: tuple[int, ...] = (0,)
     """Index of each episode in its replicate, counted from 0."""
+    video: bool = False
+    """Whether to film every frame; needs the extra film, and seconds for each second."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("dataset")
     """Folder to write, which must not exist yet."""
 
@@ -161,7 +163,7 @@ class ExportDataset(_Stored):
         run = self._find()
         with Progress("steps") as progress:
             seen = write_episodes(
-                run, self.episodes, self.out, self.protocol, progress.update, self.controller
+                run, self.episodes, self.out, self.protocol, progress.update, self.controller, self.video
             )
         verified = sum(not again.differences for again in seen)
         for again in seen:

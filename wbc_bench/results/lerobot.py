@@ -6,6 +6,7 @@ cannot be installed, so the files are written by pyarrow.
 """
 
 import io
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,6 +45,18 @@ class Episode(NamedTuple):
     about: Mapping[str, str | int | float | bool]  # columns of the table of episodes
 
 
+Statistics = dict[str, Any]  # name of a statistic -> a number for each number of the feature
+
+
+class Video(NamedTuple):
+    """A picture for every frame of all episodes, one after another."""
+
+    name: str  # of the feature
+    file: Path  # MP4, H.264, which becomes part of the dataset
+    size: tuple[int, int]  # [px] width, height
+    statistics: Sequence[Statistics]  # of each episode, then of all; see `picture_statistics`
+
+
 def write_dataset(
     folder: Path,
     episodes: Sequence[Episode],
@@ -51,6 +64,7 @@ def write_dataset(
     rate: int,
     robot: str,
     about: Mapping[str, Any],
+    video: Video | None = None,
 ) -> None:
     """Write a dataset into a folder that does not exist yet, whole or not at all; equal input, equal bytes.
 
@@ -61,6 +75,7 @@ def write_dataset(
         rate: [Hz] of the frames.
         robot: Its name.
         about: What else the file `meta/info.json` says, under the key `wbc_bench`.
+        video: Pictures of the frames, if there are any.
 
     Raises:
         StoreError: The folder is there, cannot be written, or there are no or too many frames.
@@ -85,16 +100,20 @@ def write_dataset(
         "fps": rate,
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": DATA,
-        "video_path": None,
+        "video_path": VIDEO if video else None,
         "features": {
             **{n: {"dtype": "float32", "shape": [len(of)], "names": list(of)} for n, of in names.items()},
             **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDICES.items()},
+            **({video.name: _video_feature(video, rate)} if video else {}),
         },
         "wbc_bench": dict(about),
     }
     rows = []
     for k, episode in enumerate(episodes):
         part = {name: value[starts[k] : starts[k + 1]] for name, value in columns.items()}
+        statistics = _statistics(part)
+        if video:
+            statistics[video.name] = video.statistics[k]
         rows.append(
             {
                 "episode_index": k,
@@ -107,17 +126,19 @@ def write_dataset(
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
                 **episode.about,
+                **(_video_columns(video, starts[k] / rate, starts[k + 1] / rate) if video else {}),
                 **{
                     f"stats/{name}/{what}": number
-                    for name, stats in _statistics(part).items()
+                    for name, stats in statistics.items()
                     for what, number in stats.items()
                 },
             }
         )
     first = {"chunk_index": 0, "file_index": 0}
+    statistics = _statistics(columns) | ({video.name: video.statistics[-1]} if video else {})
     files = {
         INFO: msgspec.json.format(msgspec.json.encode(info)),
-        STATS: msgspec.json.format(msgspec.json.encode(_statistics(columns))),
+        STATS: msgspec.json.format(msgspec.json.encode(statistics)),
         TASKS: _task_table(tasks),
         EPISODES.format(**first): _parquet(pa.Table.from_pylist(rows)),
         DATA.format(**first): _parquet(_table(columns)),
@@ -128,9 +149,38 @@ def write_dataset(
             for name, data in files.items():
                 (scratch / name).parent.mkdir(parents=True, exist_ok=True)
                 write_atomic(scratch / name, data)
+            if video:
+                place = scratch / VIDEO.format(**first, video_key=video.name)
+                place.parent.mkdir(parents=True)
+                shutil.copyfile(video.file, place)
             scratch.rename(folder)
     except OSError as error:
         raise StoreError(f"cannot write '{folder}': {error.strerror}") from error
+
+
+def _video_feature(video: Video, rate: int) -> dict[str, Any]:
+    width, height = video.size
+    kind = {"video.height": height, "video.width": width, "video.codec": "h264", "video.pix_fmt": "yuv420p"}
+    kind |= {"video.is_depth_map": False, "video.fps": rate, "video.channels": 3, "has_audio": False}
+    names = ["height", "width", "channels"]
+    return {"dtype": "video", "shape": [height, width, 3], "names": names, "info": kind}
+
+
+def _video_columns(video: Video, start: float, end: float) -> dict[str, int | float]:
+    """Where the pictures of an episode are: in which file, from when to when [s]."""
+    of = f"videos/{video.name}"
+    place = {f"{of}/chunk_index": 0, f"{of}/file_index": 0}
+    return place | {f"{of}/from_timestamp": float(start), f"{of}/to_timestamp": float(end)}
+
+
+def picture_statistics(pictures: NDArray[np.uint8]) -> Statistics:
+    """Statistics of pictures (N, H, W, 3) as their loader takes them: a number in [0, 1] for each colour."""
+    values = pictures.reshape(-1, 3) / 255.0
+    stats = {"min": values.min(axis=0), "max": values.max(axis=0), "mean": values.mean(axis=0)}
+    stats |= {"std": values.std(axis=0)}
+    stats |= {what: np.quantile(values, part, axis=0) for what, part in QUANTILES.items()}
+    shaped = {what: number.reshape(3, 1, 1).tolist() for what, number in stats.items()}
+    return shaped | {"count": [len(pictures)]}
 
 
 def _frames(

@@ -2,14 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from wbc_bench.errors import StoreError
-from wbc_bench.results.lerobot import POSE, Episode, write_dataset
+from wbc_bench.results.lerobot import POSE, Episode, Video, picture_statistics, write_dataset
 from wbc_bench.results.store import Run
 from wbc_bench.robot import JOINT_NAMES
 from wbc_bench.rotations import wxyz_from_matrix
+from wbc_bench.viewer.film import SIZE_OF_DATA, write_frames_of
 from wbc_bench.viewer.rerun import Rerun, ShowProgress, rerun
 
 TASK = "Move the end effector to the target pose and hold it there."
@@ -29,8 +31,11 @@ def write_episodes(
     protocol_name: str | None = None,
     progress: ShowProgress | None = None,
     controller: str | None = None,
+    video: bool = False,
 ) -> list[Rerun]:
     """Run episodes of a stored run again and write them as a dataset, one frame per control period.
+
+    With `video`, each frame has a picture of the scene, from where the whole episode is seen.
 
     Raises: see `rerun` and `write_dataset`; StoreError, the control rate is no whole number.
     """
@@ -43,15 +48,28 @@ def write_episodes(
         )
     about = {"protocol": run.record.protocol, "controller": run.record.controller, "frame": "world"}
     about |= {"tool": "ee", "quaternion": "qw, qx, qy, qz"}
-    episodes = [_episode(again) for again in seen]
-    write_dataset(folder, episodes, NAMES, round(rate), f"tron1_l5_{seen[0].robot.config.variant}", about)
+    episodes, robot = [_episode(again) for again in seen], f"tron1_l5_{seen[0].robot.config.variant}"
+    with TemporaryDirectory() as scratch:
+        filmed = _film(seen, Path(scratch, "frames.mp4"), round(rate), progress) if video else None
+        write_dataset(folder, episodes, NAMES, round(rate), robot, about, filmed)
     return seen
 
 
-def _episode(again: Rerun) -> Episode:
-    """One episode; a controller that is faster than the protocol has several moments in a frame."""
+def _frames(again: Rerun) -> list[int]:
+    """Which moments are frames: a controller that is faster than the protocol has several in a frame."""
     period = again.protocol.control_period
-    moments = [m for m in again.moments if abs(m.time / period - round(m.time / period)) < 1e-6]
+    clock = [moment.time / period for moment in again.moments]
+    return [k for k, time in enumerate(clock) if abs(time - round(time)) < 1e-6]
+
+
+def _film(seen: Sequence[Rerun], path: Path, rate: int, progress: ShowProgress | None) -> Video:
+    pictures = write_frames_of([[(again, k) for k in _frames(again)] for again in seen], path, rate, progress)
+    statistics = [picture_statistics(some) for some in (*pictures, np.concatenate(pictures))]
+    return Video("observation.images.scene", path, SIZE_OF_DATA, statistics)
+
+
+def _episode(again: Rerun) -> Episode:
+    moments = [again.moments[k] for k in _frames(again)]
     target, hand = (
         np.array([[*pos, *wxyz_from_matrix(rot)] for pos, rot in pairs])
         for pairs in (

@@ -1,7 +1,7 @@
 """An episode as a film or as a strip of pictures, drawn without a window: `wbc-bench film`."""
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -28,6 +28,7 @@ TRAIL, FORCE, PUSH = (0.16, 0.39, 0.78, 1.0), (0.17, 0.59, 0.59, 1.0), (0.82, 0.
 SUPPORT, COM = (0.35, 0.67, 0.90, 1.0), (0.09, 0.14, 0.25, 1.0)
 TRAIL_PIECES = 50  # at most, evenly over the past
 INK, LINE, FAULT = (27, 35, 48), (184, 190, 198), (176, 58, 30)
+SIZE_OF_DATA, SAMPLED = (320, 240), 25  # [px] in a dataset; one picture in 25 counts for its statistics
 TOLD = 3  # events, the last ones, in words
 AZIMUTH, ELEVATION = 218.0, -14.0  # [deg]
 MARGIN = 0.22  # [m] around what must be seen: half the width of a part, and the labels
@@ -62,35 +63,47 @@ def _write_film(
     progress: ShowProgress | None,
 ) -> None:
     """Film episodes, each with its title and the number of its last events to tell, `size` pixels each."""
+    rate = 1 / (EVERY * shown[0][0].protocol.control_period)  # [1/s]
+    count = max(len(range(0, len(again.moments), EVERY)) for again, *_ in shown)
+    whole = columns * size[0], -(-len(shown) // columns) * size[1]
+    with contextlib.ExitStack() as stack:
+        cameras = [stack.enter_context(Camera(again, size)) for again, *_ in shown]
+        write = stack.enter_context(_writer(path, whole, rate, [], count))
+        for number in range(count):
+            pictures = [
+                camera.picture(min(number * EVERY, len(again.moments) - 1), title, told)
+                for camera, (again, title, told) in zip(cameras, shown, strict=True)
+            ]
+            write(_tiled(pictures, columns))
+            if progress is not None:
+                progress(number + 1, count, "filming")
+
+
+@contextlib.contextmanager
+def _writer(
+    path: Path, size: tuple[int, int], rate: float, options: list[str], count: int
+) -> Iterator[Callable[[Pixels], None]]:
+    """What takes `count` pictures of a film, which is there in the end or not at all.
+
+    Raises: BenchError without imageio-ffmpeg; StoreError when it cannot be written.
+    """
     try:
         from imageio_ffmpeg import count_frames_and_secs, write_frames
     except ImportError as error:
         raise BenchError(missing_extra("a film", "film", error)) from error
     part = temporary(path)
-    rate = 1 / (EVERY * shown[0][0].protocol.control_period)  # [1/s]
-    count = max(len(range(0, len(again.moments), EVERY)) for again, *_ in shown)
-    whole = columns * size[0], -(-len(shown) // columns) * size[1]
     try:
-        with contextlib.ExitStack() as stack:
-            cameras = [stack.enter_context(Camera(again, size)) for again, *_ in shown]
-            writer = write_frames(
-                str(part),
-                whole,  # pyright: ignore[reportArgumentType]
-                fps=rate,  # pyright: ignore[reportArgumentType]
-                quality=7,
-                ffmpeg_log_level="error",
-                output_params=["-f", "mp4"],
-            )
-            writer.send(None)
-            for number in range(count):
-                pictures = [
-                    camera.picture(min(number * EVERY, len(again.moments) - 1), title, told)
-                    for camera, (again, title, told) in zip(cameras, shown, strict=True)
-                ]
-                writer.send(_tiled(pictures, columns))
-                if progress is not None:
-                    progress(number + 1, count, "filming")
-            writer.close()
+        writer = write_frames(
+            str(part),
+            size,  # pyright: ignore[reportArgumentType]
+            fps=rate,  # pyright: ignore[reportArgumentType]
+            quality=7,
+            ffmpeg_log_level="error",
+            output_params=[*options, "-f", "mp4"],
+        )
+        writer.send(None)
+        yield writer.send
+        writer.close()
         # the encoder says nothing where its disk is full
         if count_frames_and_secs(str(part))[0] != count:
             raise OSError("the film was cut short: is the disk full?")
@@ -107,6 +120,39 @@ def _tiled(pictures: list[Pixels], columns: int) -> Pixels:
     filled = pictures + [empty] * (-len(pictures) % columns)
     rows = [np.concatenate(filled[k : k + columns], axis=1) for k in range(0, len(filled), columns)]
     return np.ascontiguousarray(np.concatenate(rows))
+
+
+def write_frames_of(
+    seen: Sequence[Sequence[tuple[Rerun, int]]], path: Path, rate: int, progress: ShowProgress | None = None
+) -> list[Pixels]:
+    """Film chosen moments of episodes, one episode after another, without any words.
+
+    Args:
+        seen: For each episode its moments by number.
+        path: The MP4 to write; each picture can be read with at most one before it.
+        rate: [Hz] of the pictures.
+        progress: Told how far it is.
+
+    Returns:
+        For each episode some pictures, (N, H, W, 3) at a quarter of the size, for statistics.
+
+    Raises: BenchError without OpenGL or imageio-ffmpeg; StoreError when it cannot be written.
+    """
+    count, done, kept = sum(map(len, seen)), 0, []
+    with _writer(path, SIZE_OF_DATA, rate, ["-g", "2", "-bf", "0"], count) as write:
+        for moments in seen:
+            some = []
+            with Camera(moments[0][0], SIZE_OF_DATA) as camera:
+                for number, (_, k) in enumerate(moments):
+                    picture = camera.picture(k, words=False)
+                    write(picture)
+                    if number % SAMPLED == 0:
+                        some.append(picture[::4, ::4])
+                    done += 1
+                    if progress is not None:
+                        progress(done, count, "filming")
+            kept.append(np.array(some))
+    return kept
 
 
 def strip_of(again: Rerun, times: Sequence[float] | None = None) -> Pixels:
@@ -164,8 +210,11 @@ class Camera:
     def __exit__(self, *_: object) -> None:
         self._canvas.__exit__()
 
-    def picture(self, k: int, title: str = "", told: int = 0) -> Pixels:
-        """The k-th moment and the way to it in pixels (height, width, 3), the last `told` events in words."""
+    def picture(self, k: int, title: str = "", told: int = 0, words: bool = True) -> Pixels:
+        """The k-th moment and the way to it in pixels (height, width, 3), the last `told` events in words.
+
+        Without words it is the scene alone.
+        """
         moment, scene, skeleton = self._again.moments[k], self._scene, self._skeleton
         skeleton.place(moment)
         mujoco.mj_comPos(skeleton.model, skeleton.data)
@@ -181,6 +230,8 @@ class Camera:
         line = [m.ee_pos_w for m in past[:: -(-len(past) // TRAIL_PIECES)]] + [moment.ee_pos_w]
         for start, end in pairwise(line):
             add_connector(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.004, start, end, TRAIL)
+        if not words:
+            return np.ascontiguousarray(self._canvas.draw(scene))
         picture = _label(self._canvas.draw(scene), moment, title)
         return _with_time_line(picture, self._events, moment.time, told) if told else picture
 
