@@ -236,11 +236,14 @@ class ControlLoop:
 
     def _array(self, what: str, given: object, kinds: str, shape: tuple[int, ...]) -> NDArray:
         """A part of a command. Raises: ControllerError, its shape or NumPy's kind of its values is wrong."""
-        try:
-            with self.blamed("act"):  # an object may have its own way to become an array
-                found = np.asarray(given)
-        except ControllerError as error:
-            raise ControllerError(f"{error}; {what} are no array, expected {shape}") from error
+        if type(given) is np.ndarray:
+            found = given
+        else:
+            try:
+                with self.blamed("act"):  # an object may have its own way to become an array
+                    found = np.asarray(given)
+            except ControllerError as error:
+                raise ControllerError(f"{error}; {what} are no array, expected {shape}") from error
         name, valid = self._controller.info.name, "booleans" if kinds == "b" else "real numbers"
         if found.dtype.kind not in kinds:
             odd = next(iter(found.flat), None)
