@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional
 
@@ -15,12 +15,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PolicyImport:
-    """Write a first card for an ONNX file, and say what is missing in it."""
+    """Write a first card for an ONNX file, and say what is missing in it.
+
+    Of a PyTorch checkpoint, FILE.pt, the actor is written as FILE.onnx first.
+    """
 
     network: Positional[Path]
-    """Path of the policy, FILE.onnx."""
+    """Path of the policy, FILE.onnx, or of a checkpoint of rsl_rl, FILE.pt; no code in it runs."""
     description: Path | None = None
     """Path of an Isaac Lab IO descriptor or a Unitree deploy.yaml; its metadata when not given."""
+    activation: Literal["Elu", "Relu", "Tanh", "Selu", "LeakyRelu"] = "Elu"
+    """Function between the layers of a checkpoint, which does not hold it."""
     out: Path | None = None
     """Path of the card to write, beside the policy; FILE.toml when not given."""
 
@@ -33,11 +38,42 @@ class PolicyImport:
             raise UsageError(f"--out {out}: exists, valid: a new file")
         if out.parent.resolve() != self.network.parent.resolve():
             raise UsageError(f"--out {out}: valid: a file beside '{self.network}', which the card names")
-        found = draft(self.network, self.description)
-        write_atomic(out, found.text().encode())
+        network, asked = self._network()
+        try:
+            found = draft(network, self.description)
+            found.missing += asked
+            write_atomic(out, found.text().encode())
+        except BaseException:
+            if network != self.network:
+                network.unlink(missing_ok=True)  # made a moment ago, for this card
+            raise
         print(out)
         for text in found.missing:
             print(f"missing: {text}")
+
+    def _network(self) -> tuple[Path, list[str]]:
+        """The ONNX file, made of a checkpoint if that is what was given; and what must then be asked for."""
+        if self.network.suffix not in (".pt", ".pth"):
+            return self.network, []
+        from wbc_bench.files import write_atomic
+        from wbc_bench.policies.state_dict import onnx_of, read_perceptron
+
+        made = self.network.with_suffix(".onnx")
+        if made.exists():
+            raise UsageError(f"'{made}' exists, valid: a checkpoint beside which there is none")
+        found = read_perceptron(self.network)
+        write_atomic(made, onnx_of(found, self.activation))
+        print(made)
+        asked = [f"the activation between the layers: {self.activation} was taken, see --activation"]
+        if found.mean is None:
+            asked.append(
+                "whether observations are normalised: the checkpoint has no mean and deviation of them"
+            )
+        if found.others:
+            asked.append(
+                f"whether the policy needs other networks of the checkpoint: {', '.join(found.others)}"
+            )
+        return made, asked
 
 
 @dataclass(frozen=True)
