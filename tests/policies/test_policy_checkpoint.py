@@ -1,6 +1,7 @@
 """PyTorch checkpoints as policies: the numbers of the network that wrote them, and no code of theirs."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,14 @@ torch = pytest.importorskip("torch")
 ort = pytest.importorskip("onnxruntime")
 
 
-def perceptron(seed: int, activation: type = torch.nn.ELU) -> torch.nn.Sequential:
+def perceptron(seed: int, activation: Any = torch.nn.ELU) -> Any:
     torch.manual_seed(seed)
     return torch.nn.Sequential(
         torch.nn.Linear(20, 32), activation(), torch.nn.Linear(32, 16), activation(), torch.nn.Linear(16, 14)
     )
 
 
-def named(network: torch.nn.Module, prefix: str) -> dict[str, torch.Tensor]:
+def named(network: Any, prefix: str) -> dict[str, Any]:
     return {f"{prefix}{name}": value for name, value in network.state_dict().items()}
 
 
