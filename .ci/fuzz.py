@@ -79,7 +79,17 @@ def rows(numbers: range):
                 line = process.stdout.readline() if ready else b""
                 if not line:
                     break
-                row = json.loads(line)
+                try:
+                    row = json.loads(line)
+                except ValueError:  # a reader, or a library below it, has printed something
+                    yield {
+                        "number": first,
+                        "reader": "?",
+                        "seconds": 0.0,
+                        "grown": 0,
+                        "fault": f"printed {line!r}",
+                    }
+                    continue
                 begun = begun or "begun" in row
                 if "number" in row:
                     yield row

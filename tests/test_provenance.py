@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -164,3 +165,11 @@ def test_imports_for_type_checkers_and_relative_ones(tmp_path, monkeypatch):
     __import__("pack.inner.start")
     found = [path.relative_to(package).as_posix() for path in provenance.sources("pack.inner.start")]
     assert found == ["__init__.py", "far.py", "inner/__init__.py", "inner/near.py", "inner/start.py"]
+
+
+def test_a_declared_file_whose_name_none_can_have_is_one_line():
+    class Odd:
+        info = SimpleNamespace(files=("a\0b",))
+
+    with pytest.raises(ControllerError, match=r"'a\\x00b', declared in `info.files`, cannot be read"):
+        provenance.software(Odd())

@@ -74,6 +74,11 @@ def write_atomic(path: Path, data: bytes) -> None:
         ) from error
 
 
+def real_path(path: Path | str) -> Path:
+    """Where a path leads through its links; unlike `Path.resolve`, links in a circle are no error."""
+    return Path(os.path.realpath(path))
+
+
 def temporary(path: Path) -> Path:
     """What a file is called beside its place until it is whole; a name of any length leaves room for that."""
     return path.with_name(f".{path.name[: LONGEST_NAME // 2]}.{os.getpid()}.tmp")

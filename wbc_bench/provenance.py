@@ -130,9 +130,10 @@ def software(controller: object) -> Software:
             raise ControllerError(f"file '{path}', declared in `info.files`, is not a file")
         try:
             _add(digest, path.name, path.read_bytes())
-        except OSError as error:
+        except (OSError, ValueError) as error:  # the second of a name that no file can have
             raise ControllerError(
-                f"file '{path}', declared in `info.files`, cannot be read: {error.strerror}"
+                f"file {str(path)!r}, declared in `info.files`, cannot be read: "
+                f"{getattr(error, 'strerror', error)}"
             ) from error
     for part in vars(controller).values() if hasattr(controller, "__dict__") else ():
         if hasattr(part, "info") and hasattr(part, "act"):

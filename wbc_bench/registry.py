@@ -20,6 +20,7 @@ from wbc_bench.controller import (
     SeededFactory,
 )
 from wbc_bench.errors import ControllerError, UnknownNameError
+from wbc_bench.files import real_path
 from wbc_bench.installed import controllers
 from wbc_bench.isolation import blamed, import_alone_from
 from wbc_bench.robot import Robot
@@ -202,7 +203,7 @@ def variants_of(point: EntryPoint) -> list[tuple[str, str]]:
 
 
 def _load_attribute(module: str, attribute: str):
-    path = Path(module).resolve() if module.endswith(".py") else None
+    path = real_path(module) if module.endswith(".py") else None
     if path is None:
         folder = str(Path.cwd())
     else:
@@ -223,7 +224,7 @@ def _load_attribute(module: str, attribute: str):
         raise UnknownNameError(
             "controller", module, controllers(), "--controller; no such module either"
         ) from error
-    if path is not None and Path(found.__file__ or "").resolve() != path:
+    if path is not None and real_path(found.__file__ or "") != path:
         raise ControllerError(
             f"controller file '{path}': the name '{module}' belongs to {found.__file__ or 'Python'}, "
             "give the file another"
@@ -279,5 +280,5 @@ def _forget(modules: Iterable[str]) -> None:
         importlib.invalidate_caches()
         for name, loaded in list(sys.modules.items()):
             file = getattr(loaded, "__file__", None)
-            if file and Path(file).resolve() in files:
+            if file and real_path(file) in files:
                 del sys.modules[name]

@@ -12,6 +12,7 @@ from wbc_bench.episodes.freeze import build_manifest, freeze
 from wbc_bench.episodes.kinds import kind_of
 from wbc_bench.episodes.manifest import EpisodeManifest, manifest_path, read_manifest, write_manifest
 from wbc_bench.episodes.protocol import find_protocol, protocol_names, read_protocol
+from wbc_bench.episodes.static_solver import static_solver
 from wbc_bench.episodes.targets import BEYOND
 from wbc_bench.episodes.verify import verify
 from wbc_bench.errors import ManifestError, ProtocolError
@@ -305,3 +306,23 @@ def test_a_protocol_of_ones_own_may_not_bear_a_released_name(tmp_path):
     file.write_text(text.replace("seed = ", "seed = 1"))
     with pytest.raises(ProtocolError, match=r"'smoke_v1' is the name of a released.*`\$\.name`"):
         find_protocol(str(file))
+
+
+def test_links_in_a_circle_are_a_manifest_that_does_not_exist(tmp_path):
+    protocol, _ = find_protocol("smoke_v1")
+    circle = tmp_path / "smoke_v1.parquet"
+    circle.symlink_to(circle)
+    with pytest.raises(ManifestError, match="does not exist: make it with"):
+        read_manifest(protocol, circle)
+
+
+@pytest.mark.parametrize("value", [1e300, np.inf, np.nan])
+def test_a_configuration_out_of_this_world_is_a_violation(value):
+    protocol, path = find_protocol("smoke_v1")
+    manifest, _ = read_manifest(protocol, manifest_path(path))
+    limits = protocol.termination
+    solver = static_solver(protocol.robot, 0.02, limits.tilt, limits.base_height)
+    for column in (0, 3, 12):
+        qpos = manifest.feasible_qpos[0].copy()
+        qpos[column] = value
+        assert solver.violations(qpos)

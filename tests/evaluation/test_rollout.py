@@ -241,12 +241,13 @@ def test_a_wrong_shape_names_the_right_one(
     assert str(shape) in str(caught.value)
 
 
-def test_a_wrong_control_period(short: EvalProtocol, disturbed: EpisodeManifest) -> None:
+@pytest.mark.parametrize("period", [0.03, np.inf, np.nan, 0.0, -0.02])
+def test_a_wrong_control_period(short: EvalProtocol, disturbed: EpisodeManifest, period: float) -> None:
     with pytest.raises(
         ControllerError,
-        match=r"'recorder' runs every 0.03 s, protocol smoke_v1 asks for 0.02 s, valid",
+        match=rf"'recorder' runs every {period:g} s, protocol smoke_v1 asks for 0.02 s, valid",
     ):
-        rollout(Recorder(period=0.03), short, disturbed)
+        rollout(Recorder(period=period), short, disturbed)
 
 
 @pytest.mark.parametrize("period", [0.004, 0.01, 0.02, 0.06])

@@ -380,3 +380,13 @@ def test_nothing_of_a_file_is_executed(tmp_path: Path, content: str) -> None:
     with pytest.raises(ControllerError, match=r"pickled file|ONNX file that can be run"):
         load_controller(card(tmp_path, PLAIN), ROBOT)
     assert not (tmp_path / "executed").exists()
+
+
+@pytest.mark.parametrize("name", [b"obs", b"actions", b"batch"])
+def test_a_graph_with_names_that_are_no_text_is_one_line(tmp_path: Path, capfd, name: bytes) -> None:
+    """The runtime's own wrapper would print to standard output and try the same again."""
+    path = layer(tmp_path / "net.onnx", weights(0, 3, 14))
+    path.write_bytes(path.read_bytes().replace(name, b"\xf0" + name[1:]))
+    with pytest.raises(ControllerError, match=r"net\.onnx' is damaged or not an ONNX file"):
+        load_controller(card(tmp_path, PLAIN), ROBOT)
+    assert capfd.readouterr() == ("", "")

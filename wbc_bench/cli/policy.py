@@ -30,13 +30,13 @@ class PolicyImport:
     """Path of the card to write, beside the policy; FILE.toml when not given."""
 
     def run(self) -> None:
-        from wbc_bench.files import write_atomic
+        from wbc_bench.files import real_path, write_atomic
         from wbc_bench.policies.descriptions import draft
 
         out = self.out or self.network.with_suffix(".toml")
         if out.exists():
             raise UsageError(f"--out {out}: exists, valid: a new file")
-        if out.parent.resolve() != self.network.parent.resolve():
+        if real_path(out.parent) != real_path(self.network.parent):
             raise UsageError(f"--out {out}: valid: a file beside '{self.network}', which the card names")
         network, asked = self._network()
         try:

@@ -13,7 +13,7 @@ from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.episodes.rows import EpisodeManifest
 from wbc_bench.episodes.targets import Progress
 from wbc_bench.errors import ManifestError, StoreError
-from wbc_bench.files import PROTOCOLS, ensure_file_writable, scratch_folder
+from wbc_bench.files import PROTOCOLS, ensure_file_writable, real_path, scratch_folder
 
 
 def freeze(
@@ -55,7 +55,7 @@ def freeze(
 
 def _refuse_released(path: Path) -> None:
     """Raises: ManifestError, the file is a released manifest: another processor would give it other bytes."""
-    if path.exists() and path.resolve().parent == PROTOCOLS.resolve():
+    if path.exists() and real_path(path).parent == real_path(PROTOCOLS):
         raise ManifestError(
             f"manifest '{path}' is released and never written anew: copy the protocol under another name"
         )

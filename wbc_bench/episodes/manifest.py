@@ -14,7 +14,7 @@ from wbc_bench.episodes.manifest_values import mistakes
 from wbc_bench.episodes.protocol import MAX_PUSHES, EvalProtocol
 from wbc_bench.episodes.rows import EpisodeManifest, neutral
 from wbc_bench.errors import ManifestError
-from wbc_bench.files import PROTOCOLS
+from wbc_bench.files import PROTOCOLS, real_path
 from wbc_bench.readers import check_columns, decode_parquet, read_bytes, read_digest
 from wbc_bench.robot import NUM_JOINTS, NUM_LEG_JOINTS, load_robot
 
@@ -154,7 +154,7 @@ def _array(table: pa.Table, field: str) -> np.ndarray:
 
 def _given(path: Path) -> str:
     """How a command is given the protocol of a manifest: one of a user's own is found by its file alone."""
-    released = path.resolve().parent == PROTOCOLS.resolve()
+    released = real_path(path).parent == real_path(PROTOCOLS)
     return path.stem if released else quote(str(path.with_suffix(".toml")))
 
 

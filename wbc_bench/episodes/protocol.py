@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal, NoReturn
 import msgspec
 
 from wbc_bench.errors import ProtocolError, UnknownNameError
-from wbc_bench.files import LONGEST_NAME, PROTOCOLS, is_folder_name
+from wbc_bench.files import LONGEST_NAME, PROTOCOLS, is_folder_name, real_path
 from wbc_bench.readers import read_toml
 from wbc_bench.robot import RobotConfig, load_facts
 from wbc_bench.schema import meaning_digest
@@ -287,7 +287,7 @@ def find_protocol(name: str) -> tuple[EvalProtocol, Path]:
             raise UnknownNameError("protocol", name, protocol_names(), "--protocol")
     protocol = read_protocol(path)
     released = PROTOCOLS / f"{protocol.name}.toml"
-    own = path.resolve() != released.resolve()
+    own = real_path(path) != real_path(released)
     if own and protocol.name in protocol_names() and protocol.digest != read_protocol(released).digest:
         raise ProtocolError(
             f"protocol {path}: '{protocol.name}' is the name of a released protocol, and this one differs: "

@@ -20,7 +20,7 @@ from wbc_bench.episodes.protocol import EvalProtocol, check_protocol, find_proto
 from wbc_bench.episodes.targets import Progress
 from wbc_bench.episodes.verify import verify
 from wbc_bench.errors import BenchError
-from wbc_bench.files import PROTOCOLS, SEALED, ensure_writable, scratch_folder, write_atomic
+from wbc_bench.files import PROTOCOLS, SEALED, ensure_writable, real_path, scratch_folder, write_atomic
 from wbc_bench.readers import decode_parquet, read_bytes, read_json
 
 LEAST_SECRET = 16  # [B] 128 bits, which nobody can try one by one
@@ -254,7 +254,7 @@ def _files(sealed: EvalProtocol, data: bytes) -> dict[str, bytes]:
 
 def _open(out: Path, sealed: EvalProtocol) -> None:
     """Refuse a folder before minutes are spent on what cannot be kept there."""
-    if out.resolve().is_relative_to(PROTOCOLS.resolve()):
+    if real_path(out).is_relative_to(real_path(PROTOCOLS)):
         raise SealError(f"folder '{out}' is that of released protocols, valid: a folder of your own")
     ensure_writable(out)
     _refuse_other(out, {f"{sealed.name}.toml": protocol_toml(sealed).encode()})

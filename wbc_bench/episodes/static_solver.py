@@ -26,6 +26,7 @@ from wbc_bench.rotations import matrix_from_rpy, matrix_from_wxyz, wxyz_from_mat
 Array = NDArray[np.float64]
 
 JOINT_MARGIN = 0.02  # [rad] to every joint limit; choice: twice the noise of a joint sensor
+FAR = 1e3  # [m] or [rad]; choice: beyond it no configuration of the robot is meant
 EFFORT_SHARE = 0.9  # of the joint efforts; choice: a tenth is left for feedback
 CLEARANCE = 0.01  # [m] of everything but the soles above the ground
 TILT_SHARE = 0.9  # of the tilt at which an episode ends
@@ -334,6 +335,8 @@ class StaticSolver:
 
     def violations(self, qpos: Array) -> list[str]:
         """What is wrong with a configuration (21,) in the world, by MuJoCo alone; empty if it is feasible."""
+        if not (np.abs(qpos) < FAR).all():  # nor NaN; a damaged file may hold any number
+            return ["values without bounds"]
         pos, rot = to_ground_frame(self.ground_frame_of(qpos), qpos[:3], matrix_from_wxyz(qpos[3:7]))
         qpos = np.concatenate([pos, wxyz_from_matrix(rot), qpos[7:]])
         wrong = []

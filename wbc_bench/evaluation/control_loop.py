@@ -1,5 +1,6 @@
 """A shard of episodes under one controller, a control step at a time."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -47,8 +48,8 @@ def at_rate_of(controller: Controller, protocol: EvalProtocol) -> tuple[EvalProt
 
     Noise is then drawn at the controller's rate, like that of its sensors.
     """
-    parts = round(protocol.control_period / max(controller.info.control_period, 1e-9))
-    physics = protocol.physics
+    own, physics = controller.info.control_period, protocol.physics
+    parts = round(protocol.control_period / max(own, 1e-9)) if math.isfinite(own) else 0
     if parts <= 1 or physics.decimation % parts:
         return protocol, 1
     physics = msgspec.structs.replace(physics, decimation=physics.decimation // parts)
@@ -75,7 +76,8 @@ class ControlLoop:
         protocol, self.parts = at_rate_of(controller, protocol)
         self.period = period = protocol.control_period  # [s]
         count = len(rows)
-        self._every = round(controller.info.control_period / period)  # control steps per call of `act`
+        ratio = controller.info.control_period / period
+        self._every = round(ratio) if math.isfinite(ratio) else 0  # control steps per call of `act`
         if self._every < 1 or abs(controller.info.control_period - self._every * period) > 1e-9:
             raise ControllerError(
                 f"controller '{controller.info.name}' runs every {controller.info.control_period:g} s, "

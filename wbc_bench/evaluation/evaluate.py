@@ -13,7 +13,7 @@ from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import BenchError, UnknownNameError
 from wbc_bench.evaluation.execution import Job, run_jobs
 from wbc_bench.evaluation.workers import Engine
-from wbc_bench.files import PROTOCOLS, ensure_writable
+from wbc_bench.files import PROTOCOLS, ensure_writable, real_path
 from wbc_bench.registry import ControllerFactory, build_controller, pack_controller, spec_of_replicate
 from wbc_bench.results import stats
 from wbc_bench.results.analysis import Evaluated, collect, column
@@ -182,7 +182,7 @@ def evaluate_all(
             jobs.append(Job(*frozen, name, replicates, asked.episodes, packed))
     ensure_writable(store.root)
     run_jobs(jobs, store, engine, overwrite)
-    if asked.path.resolve().parent != PROTOCOLS.resolve():
+    if real_path(asked.path).parent != real_path(PROTOCOLS):
         store.keep_protocol(asked.protocol.name, asked.path, manifest_path(asked.path))
     return skipped
 

@@ -178,8 +178,9 @@ def open_session(path: Path):
         )
     with reading("policy", path, "an ONNX file that can be run", ControllerError):
         session = _session(data)
-        # names may be no text, which is found when they are asked for
-        _ = session.get_inputs(), session.get_outputs(), session.get_modelmeta().custom_metadata_map
+        # names, also those of axes, may be no text, which is found when they are asked for
+        _ = [(v.name, v.type, v.shape) for v in (*session.get_inputs(), *session.get_outputs())]
+        _ = session.get_modelmeta().custom_metadata_map
         return session
 
 
@@ -191,4 +192,4 @@ def _session(data: bytes):
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4
-    return onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
+    return onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"], enable_fallback=0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.errors import SourceError, UnknownNameError
+from wbc_bench.files import real_path
 from wbc_bench.readers import is_file, read_bytes, read_parquet, reading
 from wbc_bench.rotations import matrix_from_rotvec
 from wbc_bench.sources.diffusion.zarr_archive import episode_slices, read_archive
@@ -89,7 +90,7 @@ def load_recording(name: str) -> Recording:
 
 def _plain(path: Path) -> str:
     """The name of a file without its endings, in letters that a record may be named with."""
-    stem = path.resolve().name.partition(".")[0]
+    stem = real_path(path).name.partition(".")[0]
     return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "-" for c in stem) or "recording"
 
 

@@ -39,7 +39,9 @@ class OnnxEngine:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         with reading("policy", path, "an ONNX file that can be run", CheckpointError):
-            self._session = onnxruntime.InferenceSession(data, options, ["CPUExecutionProvider"])
+            self._session = onnxruntime.InferenceSession(
+                data, options, ["CPUExecutionProvider"], enable_fallback=0
+            )
             text = self._session.get_modelmeta().custom_metadata_map.get(CARD)
         if text is None:
             raise CheckpointError(f"'{path}' carries no card, valid: a file that `export` of wbc-bench wrote")
