@@ -20,7 +20,7 @@ from wbc_bench.episodes.protocol import (
 from wbc_bench.errors import BenchError, StoreError, UnknownNameError
 from wbc_bench.files import PROTOCOLS, made_whole
 from wbc_bench.results import report
-from wbc_bench.results.analysis import Evaluated, collect_all
+from wbc_bench.results.analysis import Evaluated, collect_all, label_of
 from wbc_bench.results.doors import DoorRun, door_table, read_doors
 from wbc_bench.results.figures.reach import write_reach_figures
 from wbc_bench.results.figures.stress import write_stress_figure
@@ -34,7 +34,14 @@ from wbc_bench.results.kept import NOTE, KeptParts
 from wbc_bench.results.margins import analyse
 from wbc_bench.results.store import ResultStore
 from wbc_bench.results.stress import read_stress
-from wbc_bench.results.study import Study, StudyError, labels_of, released_rows, released_studies, studies_of
+from wbc_bench.results.study import (
+    Study,
+    StudyError,
+    labels_of,
+    released_rows,
+    released_studies,
+    studies_of,
+)
 from wbc_bench.results.tables.stress import write_stress_tables
 from wbc_bench.results.tables.write import write_reach_tables, write_sealed_tables, write_study_tables
 from wbc_bench.results.tracking import Track, read_tracks, tracking_table
@@ -84,7 +91,7 @@ def publish(
             raise UnknownNameError("evaluated controller", spec, known, "--workspace")
     specs = known | {track.record.controller for track in tracks}
     specs |= {climb.spec for stress in ladders for climb in stress.climbs}
-    colours = controller_colours({spec: labels.get(spec, spec) for spec in sorted(specs)}, rows)
+    colours = controller_colours({spec: label_of(spec, labels) or spec for spec in sorted(specs)}, rows)
     with made_whole(out) as (made, paths):
         kept = KeptParts(out, made, __name__)
         for protocol, methods in evaluated.items():

@@ -8,7 +8,8 @@ import pytest
 from synthetic import FakeRun, FakeStore, frame_of, methods_in, record
 from wbc_bench.errors import UnknownNameError
 from wbc_bench.publish import publish
-from wbc_bench.results.analysis import collect
+from wbc_bench.results.analysis import collect, label_of
+from wbc_bench.results.figures.style import controller_colours
 from wbc_bench.results.store import ResultStore
 from wbc_bench.results.study import Study, StudyError, find_study, labels_of, released_studies, studies_of
 from wbc_bench.results.tables.paper import paper_table
@@ -107,3 +108,12 @@ def test_a_controller_has_one_name_under_every_protocol():
     table = paper_table(studies_of("nominal_v1")[0], methods)
     assert table.rows[0][:2] == ("Evaluated", "Whole-body IK")
     assert "Controllers: Whole-body IK is `ik`." in table.notes
+
+
+def test_one_seed_of_a_method_goes_by_its_label_and_colour():
+    labels = {"learned:oracle": "Privileged oracle", "learned:mine@2": "Mine"}
+    assert label_of("learned:oracle@1", labels) == "Privileged oracle, seed 1"
+    assert label_of("learned:mine@2", labels) == "Mine" and label_of("learned:mine@3", labels) == ""
+    names = {"a": "Privileged oracle", "b": "Privileged oracle, seed 1", "c": "another"}
+    colours = controller_colours(names)
+    assert colours["a"] == colours["b"] != colours["c"]

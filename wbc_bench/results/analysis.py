@@ -116,10 +116,16 @@ def collect(runs: Iterable[RunLike], labels: Mapping[str, str] | None = None) ->
             spec,
             tuple(run.record for run in group),
             pd.concat([_episodes(run) for run in group], ignore_index=True),
-            labels.get(spec, ""),
+            label_of(spec, labels),
         )
         for spec, group in grouped.items()
     }
+
+
+def label_of(spec: str, labels: Mapping[str, str]) -> str:
+    """The label of a spec; of one seed of a method that has one, `METHOD@SEED`, with the seed; else empty."""
+    method, _, seed = spec.rpartition("@")
+    return labels.get(spec) or (f"{labels[method]}, seed {seed}" if method in labels else "")
 
 
 def _own_names(grouped: Mapping[str, list[Any]]) -> dict[str, str]:

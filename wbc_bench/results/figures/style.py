@@ -54,7 +54,10 @@ def controller_colours(names: Mapping[str, str], rows: Iterable[Row] | None = No
     """
     rows = released_rows() if rows is None else rows
     given = {row.label: COLOURS[row.colour] for row in rows if row.colour}
-    known = {name: given[name] for name in names.values() if name in given}
+    label = {
+        name: name.rpartition(", seed ")[0] or name for name in names.values()
+    }  # a seed is of its method
+    known = {name: given[of] for name, of in label.items() if of in given}
     others = sorted(set(names.values()) - known.keys())
     more = (to_hex(tuple(hsv_to_rgb((k * GOLDEN % 1.0, 0.85, (0.75, 0.5)[k % 2])))) for k in count(1))
     free = (each for each in chain(METHOD_COLOURS, more) if each not in known.values())
