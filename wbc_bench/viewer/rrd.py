@@ -36,6 +36,7 @@ def write_rrd(again: Rerun, path: Path) -> None:
     """
     try:
         import rerun as rr
+        from rerun import blueprint
     except ImportError as error:
         raise BenchError(missing_extra("a recording of Rerun", "rerun", error)) from error
     part = temporary(path)
@@ -47,6 +48,7 @@ def write_rrd(again: Rerun, path: Path) -> None:
         _add_robot(rr, stream, again)
         _add_hand(rr, stream, again)
         _add_numbers(rr, stream, again)
+        stream.send_blueprint(_layout(blueprint))
         stream.flush()
         stream.disconnect()
         part.replace(path)
@@ -54,6 +56,27 @@ def write_rrd(again: Rerun, path: Path) -> None:
         raise StoreError(f"cannot write '{path}': {' '.join(str(error).split())[:200]}") from error
     finally:
         part.unlink(missing_ok=True)
+
+
+def _layout(blueprint: Any) -> Any:
+    """The scene on the left; curves, events and words on the right."""
+    scene = blueprint.Spatial3DView(
+        origin="/", contents=["robot/**", "target/**", "hand/**", "force/**", "way_of_the_hand"], name="scene"
+    )
+    curves = [
+        blueprint.TimeSeriesView(origin=name, name=title)
+        for name, title in (
+            ("error", "errors"),
+            ("load", "forces of the ground (N)"),
+            ("joint", "joints (rad)"),
+        )
+    ]
+    words = blueprint.Horizontal(
+        blueprint.TextLogView(origin="events", name="events"),
+        blueprint.TextDocumentView(origin="about", name="episode"),
+    )
+    right = blueprint.Vertical(*curves, words)
+    return blueprint.Blueprint(blueprint.Horizontal(scene, right, column_shares=[3, 2]), collapse_panels=True)
 
 
 def _add_words(rr: Any, stream: Any, again: Rerun) -> None:
