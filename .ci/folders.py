@@ -47,7 +47,7 @@ COMMANDS = {  # name -> words; below {given} are inputs, {out} is the folder in 
     "submit": "submit hold --results {given}/store -o {out}/a.zip",
     "demo train": "demo train {given}/d.zarr.zip --updates 1 -o {out}/a.safetensors",
     "demo eval": "demo eval --expert --controller hold --episodes 1 --workers 1 --out {out}",
-    "compare": "compare hold {given}/own.py:GentleArm --protocol tiny --results {given}/store --out {out}",
+    "compare": "compare hold {given}/own.py:Own --protocol tiny --results {given}/store --out {out}",
     "report": "report --results {given}/store --out {out}",
     "seal": "protocol freeze smoke_v1 --sealed --secret-file {given}/secret --workers 1 --out {out}",
     "reveal": "protocol reveal --commitment {given}/set/smoke_v1_sealed.commitment.json --secret-file "

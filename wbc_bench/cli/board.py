@@ -32,7 +32,7 @@ class Submit:
     def run(self) -> None:
         import hashlib
 
-        from wbc_bench.files import SEALED, ensure_writable, folder_name, write_atomic
+        from wbc_bench.files import SEALED, ensure_file_writable, folder_name, write_atomic
         from wbc_bench.readers import read_text
         from wbc_bench.results.submission import SUFFIX, SubmissionError, pack
 
@@ -58,7 +58,7 @@ class Submit:
         if f"{Path.home()}/" in card:
             raise SubmissionError(f"card '{self.card}' names your home folder, valid: relative paths alone")
         data = pack(name, chosen, card)
-        ensure_writable(out.parent)
+        ensure_file_writable(out)
         write_atomic(out, data)
         print(f"{hashlib.sha256(data).hexdigest()}  {out}")
 

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_bench.errors import BenchError, StoreError, missing_extra
-from wbc_bench.files import temporary
+from wbc_bench.errors import BenchError, missing_extra
+from wbc_bench.files import write_atomic
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.robot import JOINT_NAMES
 from wbc_bench.rotations import wxyz_from_matrix
@@ -39,23 +39,15 @@ def write_rrd(again: Rerun, path: Path) -> None:
         from rerun import blueprint
     except ImportError as error:
         raise BenchError(missing_extra("a recording of Rerun", "rerun", error)) from error
-    part = temporary(path)
-    try:
-        stream = rr.RecordingStream("wbc-bench", recording_id=again.title)
-        stream.save(part)
-        stream.set_log_time_enabled(False)
-        _add_words(rr, stream, again)
-        _add_robot(rr, stream, again)
-        _add_hand(rr, stream, again)
-        _add_numbers(rr, stream, again)
-        stream.send_blueprint(_layout(blueprint))
-        stream.flush()
-        stream.disconnect()
-        part.replace(path)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise StoreError(f"cannot write '{path}': {' '.join(str(error).split())[:200]}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    stream = rr.RecordingStream("wbc-bench", recording_id=again.title)
+    memory = stream.memory_recording()  # its own writer of files says in many lines that a disk is full
+    stream.set_log_time_enabled(False)
+    _add_words(rr, stream, again)
+    _add_robot(rr, stream, again)
+    _add_hand(rr, stream, again)
+    _add_numbers(rr, stream, again)
+    stream.send_blueprint(_layout(blueprint))
+    write_atomic(path, memory.drain_as_bytes())
 
 
 def _layout(blueprint: Any) -> Any:
