@@ -59,7 +59,8 @@ COMMANDS = {  # name -> words; below {given} are inputs, {out} is the folder in 
     "export": "export --controller learned:{given}/no_latent@0.safetensors -o {out}/a.onnx",
     "bench": "bench tiny --out {out}",
     "train run": "TRAIN run {tiny} --out {out}",
-    "train campaign": "TRAIN campaign {tiny} --methods no_latent --seeds 1 --out {out}",
+    "train campaign": "TRAIN campaign --recipe {given}/recipe.toml --from-scratch --methods no_latent "
+    "--seeds 1 --threads 1 --out {out}",
     "train curves": "TRAIN curves --out {given}/runs --figures {out}",
     "train targets": "TRAIN targets --count 3 --workers 1 --path {out}/a.parquet",
     "dagger": "TRAIN dagger --teacher hold --episodes 1 --rounds 1 --undisturbed-rounds 0 --updates 1 "
@@ -449,6 +450,7 @@ def write_inputs() -> None:
     (GIVEN / "heights.toml").write_text(text)
     freeze(read_protocol(GIVEN / "heights.toml"), GIVEN / "heights.parquet")
     (GIVEN / "study.toml").write_text(STUDY)
+    (GIVEN / "recipe.toml").write_text(RECIPE)
     shutil.copy(ROOT / "protocols" / "scripts" / "figure_eight.toml", GIVEN / "still.toml")
     (GIVEN / "runs").mkdir()
     damaged_training.write_training(GIVEN / "runs")
@@ -465,6 +467,24 @@ def write_inputs() -> None:
 
 REACH = (("per_replicate", "per_replicate = 8"), ("heights", "heights = [1.0, 1.1, 0.1]"))
 REACH += (("per_height", "per_height = 1"), ("horizon", "horizon = 0.2"), ("window", "window = 0.1"))
+RECIPE = """
+name = "tiny"
+
+[common]
+budget = 192
+num_envs = 8
+num_steps_per_env = 6
+num_mini_batches = 2
+estimator_share = 0.5
+estimator_mini_batches = 2
+critic_warmup_iterations = 0
+disturbance_ramp = [0, 0]
+posture_loss = [0, 0]
+
+[from_scratch]
+
+[distilled]
+"""
 STUDY = """
 name = "few"
 protocol = "smoke_v1"

@@ -63,6 +63,7 @@ class Trials:
         self._code.mkdir()
         self._wanted: dict[Version, dict[int, bytes]] = {}
         self.version: Version = (0, 0, 0)
+        self._evaluations = 0
         self._write()
 
     def run(self, number: int) -> None:
@@ -97,7 +98,7 @@ class Trials:
     def _killed(self, store: Path, engine: str, overwrite: bool) -> tuple[bool, int, str]:
         """Begin an evaluation and kill it; whether that was possible, its exit code and what it said."""
         rng, phase = self._rng, str(self._rng.choice(["start", "middle", "merge"]))
-        said = self._scratch / "stderr"
+        said = self._heard()
         with said.open("w") as file:
             process = self._begin(store, engine, overwrite, file)
         end = time.monotonic() + (rng.uniform(0.0, 4.0) if phase == "start" else LONGEST)
@@ -121,8 +122,13 @@ class Trials:
             return True, -signal.SIGKILL, said.read_text()
         return False, process.returncode, said.read_text()
 
+    def _heard(self) -> Path:
+        """A new file for what an evaluation says: the orphans of a killed one go on to write to theirs."""
+        self._evaluations += 1
+        return self._scratch / f"stderr_{self._evaluations}"
+
     def _finish(self, store: Path, engine: str, overwrite: bool) -> tuple[int, str]:
-        written, said = _shards(store), self._scratch / "stderr"
+        written, said = _shards(store), self._heard()
         with said.open("w") as file:
             code = self._begin(store, engine, overwrite, file).wait(LONGEST)
         self._check_resumed(written, said.read_text(), overwrite)
