@@ -194,10 +194,14 @@ class Trials:
 
 def _shards(store: Path) -> dict[int, list[str]]:
     """Replicate -> names of its shards."""
-    found: dict[int, list[str]] = {}
-    for path in store.glob("runs/*/*/replicate_*/shards/shard_*.parquet"):
-        found.setdefault(int(path.parents[1].name.removeprefix("replicate_")), []).append(path.name)
-    return found
+    while True:
+        found: dict[int, list[str]] = {}
+        try:
+            for path in store.glob("runs/*/*/replicate_*/shards/shard_*.parquet"):
+                found.setdefault(int(path.parents[1].name.removeprefix("replicate_")), []).append(path.name)
+            return found
+        except FileNotFoundError:  # merged while they were listed
+            continue
 
 
 def _records(store: Path) -> dict[int, Path]:
