@@ -57,7 +57,7 @@ def faults(again: Rerun) -> list[tuple[float, str]]:
 def test_of_a_robot_that_stands_there_is_nothing_to_tell(standing: Rerun) -> None:
     assert faults(standing) == []
     assert [event.text for event in events_of(standing)] == ["success"]
-    assert story_of(standing).endswith("Nothing went wrong before the end.")
+    assert story_of(standing, events_of(standing)).endswith("Nothing went wrong before the end.")
 
 
 @pytest.mark.parametrize("way, slips", [(0.015, False), (0.03, True)])
@@ -132,10 +132,10 @@ def test_a_real_fall_is_told_everywhere(fallen: Rerun) -> None:
     assert events == sorted(events, key=lambda event: event.time)
     first = first_fault(events)
     assert first is not None and first.time < events[-1].time
-    story = story_of(fallen)
+    story = story_of(fallen, events)
     assert f"at {first.time:.2f} s: {first.text}." in story and "friction" in story
     assert story in strip_caption(fallen, [0.0])
-    page = _time_line(fallen)
+    page = _time_line(events)
     assert page.count("<rect ") == len(events) and all(event.text in page for event in events)
 
 

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -170,9 +170,10 @@ def strip_caption(again: Rerun, times: Sequence[float] | None = None) -> str:
     """What is to be seen in a strip, as the report prints it below."""
     at = ", ".join(f"{again.moments[k].time:g}" for k in _shown(again, times))
     outcome = str(again.stored["outcome"]).replace("_", " ")
+    story = story_of(again, events_of(again))
     return (
         f"{again.title}: {outcome}. At {at} s; blue line: the way of the hand, sphere: the tolerance about "
-        f"the target, green when the hand is inside it in position and orientation. {story_of(again)}\n"
+        f"the target, green when the hand is inside it in position and orientation. {story}\n"
     )
 
 
@@ -202,7 +203,11 @@ class Camera:
         half = np.tan(np.deg2rad(model.vis.global_.fovy) / 2)  # [1] height at unit distance
         self._view = _view(again.moments, np.array([half * size[0] / size[1], half]))
         self._canvas = Canvas(model, *size)
-        self._events = events_of(again)
+
+    @cached_property
+    def _events(self) -> list[Event]:
+        """Found only where they are told: that places the robot at every moment."""
+        return events_of(self._again)
 
     def __enter__(self) -> "Camera":
         return self

@@ -1,6 +1,7 @@
 """An episode as one HTML file that needs neither a server nor a network: `wbc-bench replay`."""
 
 import html
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from wbc_bench.files import write_atomic
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.viewer.rerun import EVERY, Rerun
 from wbc_bench.viewer.scene import SceneView, serving
-from wbc_bench.viewer.time_line import events_of, story_of
+from wbc_bench.viewer.time_line import Event, events_of, story_of
 
 CHART = (370, 48)  # [px] width, height of the error chart
 
@@ -47,19 +48,21 @@ def _caption(again: Rerun) -> str:
     facts = [f"<b>{html.escape(again.title)}</b>", html.escape(ends)]
     if stored["stratum"]:
         facts.append(f"stratum {html.escape(str(stored['stratum']))}")
-    facts.append(html.escape(story_of(again)))
+    events = events_of(again)
+    facts.append(html.escape(story_of(again, events)))
     style = "color:#1b7f4b" if not again.differences else "color:#a05a00"
     facts.append(f'<span style="{style}">{html.escape(again.verdict)}</span>')
+    chart = _chart(again, events)
     return (
         '<div style="position:fixed;top:12px;right:12px;z-index:5;box-sizing:border-box;width:400px;'
         "padding:10px 14px;"
         "background:rgba(255,255,255,.92);border:1px solid #d5d9de;border-radius:6px;color:#1b2330;"
-        f'font:13px/1.5 system-ui,sans-serif;pointer-events:none">{"<br>".join(facts)}{_chart(again)}</div>'
+        f'font:13px/1.5 system-ui,sans-serif;pointer-events:none">{"<br>".join(facts)}{chart}</div>'
     )
 
 
-def _chart(again: Rerun) -> str:
-    """Position and orientation error over time, each as a part of its largest value."""
+def _chart(again: Rerun, events: Sequence[Event]) -> str:
+    """Position and orientation error over time, each as a part of its largest value; events below."""
     time = np.array([moment.time for moment in again.moments])
     lines, names = [], []
     for name, unit, colour, values in (
@@ -72,15 +75,16 @@ def _chart(again: Rerun) -> str:
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x[::5], y[::5], strict=True))
         lines.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.5"/>')
         names.append(f'<span style="color:{colour}">{name} 0–{most:.1f} {unit}</span>')
+    line = _time_line(events)
     return (
         f'<svg width="{CHART[0]}" height="{CHART[1] + 2}" style="display:block;margin-top:6px;'
-        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>{_time_line(again)}error: {", ".join(names)}'
+        f'border-bottom:1px solid #b8bec6">{"".join(lines)}</svg>{line}error: {", ".join(names)}'
     )
 
 
-def _time_line(again: Rerun) -> str:
+def _time_line(events: Sequence[Event]) -> str:
     """What happened, as marks below the chart, on its axis of time, and in words."""
-    events, end = events_of(again), max(again.moments[-1].time, 1e-9)
+    end = max(events[-1].time, 1e-9)
     colours = ["#b03a1e" if event.wrong else "#1b2330" for event in events]
     places = [min(event.time / end * CHART[0], CHART[0] - 3) for event in events]
     marks = "".join(

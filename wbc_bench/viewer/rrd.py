@@ -14,7 +14,7 @@ from wbc_bench.errors import BenchError, missing_extra
 from wbc_bench.files import write_atomic
 from wbc_bench.results.formatting import CM, DEG
 from wbc_bench.robot import JOINT_NAMES
-from wbc_bench.rotations import wxyz_from_matrix
+from wbc_bench.rotations import matrix_from_wxyz, wxyz_from_matrix
 from wbc_bench.viewer.moment import METRES_A_NEWTON, Skeleton
 from wbc_bench.viewer.picture import BONE_RADIUS
 from wbc_bench.viewer.rerun import Rerun
@@ -78,11 +78,11 @@ def _add_words(rr: Any, stream: Any, again: Rerun) -> None:
         "stratum": str(again.stored["stratum"]),
         "verdict": again.verdict,
     }
-    stream.log(
-        "about", rr.TextDocument(f"{again.title}\n\n{story_of(again)}\n\n{again.verdict}"), static=True
-    )
+    events = events_of(again)
+    text = f"{again.title}\n\n{story_of(again, events)}\n\n{again.verdict}"
+    stream.log("about", rr.TextDocument(text), static=True)
     stream.log("about", rr.AnyValues(**about), static=True)
-    for event in events_of(again):
+    for event in events:
         stream.set_time(CLOCK, duration=event.time)
         level = rr.TextLogLevel.WARN if event.wrong else rr.TextLogLevel.INFO
         stream.log("events", rr.TextLog(event.text, level=level))
@@ -132,9 +132,7 @@ def _shape(rr: Any, model: mujoco.MjModel, geom: int) -> Any:
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], centers=[centre], **look)
         case mujoco.mjtGeom.mjGEOM_CAPSULE:  # theirs begins at the centre of one of its ends
-            rot = np.empty(9)
-            mujoco.mju_quat2Mat(rot, model.geom_quat[geom])
-            end = centre - size[1] * rot.reshape(3, 3)[:, 2]
+            end = centre - size[1] * matrix_from_wxyz(model.geom_quat[geom])[:, 2]
             return rr.Capsules3D(lengths=[2 * size[1]], radii=[size[0]], translations=[end], **look)
         case other:
             raise ValueError(f"shape {other} of {model.geom(geom).name} has no counterpart")

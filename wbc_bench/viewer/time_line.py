@@ -44,9 +44,9 @@ def first_fault(events: Sequence[Event]) -> Event | None:
     return next((event for event in events[:-1] if event.wrong), None)
 
 
-def story_of(again: Rerun) -> str:
-    """What the episode drew, and what went wrong first, in a sentence each."""
-    fault = first_fault(events_of(again))
+def story_of(again: Rerun, events: Sequence[Event]) -> str:
+    """What the episode drew, and what of its `events_of` went wrong first, in a sentence each."""
+    fault = first_fault(events)
     first = (
         f"First went wrong, at {fault.time:.2f} s: {fault.text}."
         if fault
