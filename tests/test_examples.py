@@ -9,7 +9,9 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 import zmq
+from onnx import helper
 
+from small_networks import weights, write
 from wbc_bench.results.store import ResultStore
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -54,6 +56,18 @@ def test_compare_two_prints_intervals_and_paired_tests(tmp_path: Path) -> None:
     first = run(sys.executable, EXAMPLES / "compare_two.py", *options, folder=tmp_path)
     assert "hold: success 0.0%" in first and "A = ik against B = hold" in first
     assert run(sys.executable, EXAMPLES / "compare_two.py", *options, folder=tmp_path) == first
+
+
+def test_walking_policy_s_card_fits_networks_of_its_shape(tmp_path: Path) -> None:
+    card = tmp_path / "tron1_walk.toml"
+    card.write_text((EXAMPLES / "walking_policy" / card.name).read_text())
+    for name, rows, columns in (("encoder", 180, 3), ("policy", 44, 8)):
+        node = helper.make_node("MatMul", ["mlp_input", "w"], ["mlp_output"])
+        shapes = {"mlp_input": [rows]}, {"mlp_output": [columns]}
+        write(tmp_path / f"{name}.onnx", [node], *shapes, {"w": weights(0, rows, columns)})
+    arguments = ("--protocol", "nominal_v2", "--replicates", "1", "--episodes", "3", "--workers", "1")
+    printed = run("wbc-bench", "eval", "--controller", f"policy:{card}", *arguments, folder=tmp_path)
+    assert "| tron1_walk" in printed
 
 
 def test_stream_client_moves_the_robot(tmp_path: Path) -> None:

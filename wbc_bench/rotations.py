@@ -120,3 +120,15 @@ def matrix_from_rho6(columns: Array) -> Array:
     y = y - (x * y).sum(axis=-1, keepdims=True) * x
     y = y / np.linalg.norm(y, axis=-1, keepdims=True)
     return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def heading_from_gravity(gravity: Array) -> Array:
+    """Rotations (N, 3, 3) from frames to those with their heading that are level.
+
+    Args:
+        gravity: (N, 3) Direction of gravity in the frames, of any length, not along their x axes.
+    """
+    up = -gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
+    x = np.array([1.0, 0.0, 0.0]) - up * up[:, :1]
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(up, x), up], axis=1)

@@ -29,13 +29,14 @@ def write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict,
     return path
 
 
-def layer(path: Path, w: np.ndarray, batch: str | int = "batch", **metadata: str) -> Path:
-    """`actions` = tanh(obs w)."""
+def layer(path: Path, w: np.ndarray, batch: str | int | None = "batch", **metadata: str) -> Path:
+    """`actions` = tanh(obs w); of vectors where `batch` is None."""
     nodes = [
         helper.make_node("MatMul", ["obs", "w"], ["product"]),
         helper.make_node("Tanh", ["product"], ["actions"]),
     ]
-    shapes = {"obs": [batch, w.shape[0]]}, {"actions": [batch, w.shape[1]]}
+    rows = [] if batch is None else [batch]
+    shapes = {"obs": [*rows, w.shape[0]]}, {"actions": [*rows, w.shape[1]]}
     return write(path, nodes, *shapes, {"w": w}, **metadata)
 
 

@@ -17,8 +17,10 @@ from wbc_bench.episodes.manifest import manifest_path, read_manifest
 from wbc_bench.episodes.protocol import EvalProtocol, find_protocol
 from wbc_bench.errors import BenchError, ControllerError
 from wbc_bench.evaluation.control_loop import ControlLoop
+from wbc_bench.policies.follower import Follower
 from wbc_bench.registry import load_controller
 from wbc_bench.robot import JOINT_NAMES, load_robot
+from wbc_bench.rotations import heading_from_gravity
 
 ROBOT = load_robot()
 LEGS, ARM = JOINT_NAMES[:8], JOINT_NAMES[8:]
@@ -110,10 +112,10 @@ def card(folder: Path, text: str) -> str:
     return f"policy:{folder / 'card.toml'}"
 
 
-@pytest.mark.parametrize("batch", ["batch", 1], ids=["batched", "batch 1"])
+@pytest.mark.parametrize("batch", ["batch", 1, None], ids=["batched", "batch 1", "vectors"])
 @pytest.mark.parametrize("names", [INTERLEAVED, SHUFFLED], ids=["interleaved", "shuffled"])
 def test_another_joint_order_with_scales(
-    tmp_path: Path, smoke: EvalProtocol, batch: str | int, names: tuple[str, ...]
+    tmp_path: Path, smoke: EvalProtocol, batch: str | int | None, names: tuple[str, ...]
 ) -> None:
     w, scale = weights(0, 51, 14, 3.0), np.linspace(0.1, 0.4, 14)
     layer(tmp_path / "net.onnx", w, batch)
@@ -288,6 +290,50 @@ def test_words_of_the_vocabulary_by_hand(tmp_path: Path, smoke: EvalProtocol, ca
     np.testing.assert_allclose(values[23:], [0.1, 0.2, 0.3], atol=1e-12)
 
 
+def test_a_walking_policy_reads_the_follower(
+    tmp_path: Path, smoke: EvalProtocol, calm_rows: CalmRows
+) -> None:
+    layer(tmp_path / "net.onnx", weights(5, 5, 8))
+    spec = card(tmp_path, WALKER.replace("LEGS", str(list(LEGS))))
+    controller = load_controller(spec, ROBOT)
+    assert controller.info.signals == {"proprioception"}
+    follower = Follower(ROBOT, 0.7, (0.4, 0.1, 0.2), (0.03, 0.05))
+    loop = ControlLoop(controller, smoke, calm_rows(3))
+    target = loop.sensors.target(loop.odometry)
+    loop.reset(target)
+    level = heading_from_gravity(loop.observation.proprioception.gravity_b)  # type: ignore[union-attr]
+    pos, rot = np.einsum("nij,nj->ni", level, target.pos_b), level @ target.rot_b
+    follower.start(pos, rot)
+    expected = follower.command(pos, rot)
+    command = loop.advance(target).q
+    values = controller.values["policy"]  # type: ignore[attr-defined]
+    np.testing.assert_allclose(values, np.column_stack([2 * expected, np.zeros((3, 2))]), atol=1e-12)
+    assert np.abs(expected).max() > 0.05
+    arm = load_controller("ik:arm", ROBOT)
+    fresh = ControlLoop(arm, smoke, calm_rows(3))
+    fresh.reset(target)
+    np.testing.assert_array_equal(command[:, 8:], fresh.advance(target).q[:, 8:])
+
+
+WALKER = """
+name = "walker"
+[[observation]]
+name = "policy"
+terms = [{ term = "velocity_commands", scale = 2.0 }, { term = "constant", value = [0.0, 0.0] }]
+[[network]]
+file = "net.onnx"
+inputs = { obs = "policy" }
+outputs = { actions = "action" }
+[action]
+joints = LEGS
+scale = 0.1
+others = "ik:arm"
+[follower]
+gain = 0.7
+limits = [0.4, 0.1, 0.2]
+"""
+
+
 def test_a_policy_is_a_row(tmp_path: Path) -> None:
     layer(tmp_path / "net.onnx", weights(0, 3, 14))
     spec = card(tmp_path, PLAIN)
@@ -335,6 +381,17 @@ MISTAKES = {
     "file": ("net.onnx", "absent.onnx", "absent.onnx' does not exist"),
     "robot": ('name = "plain"', 'robot = "paper"\nname = "plain"', "is for the robot variant 'paper'"),
     "frame": ('"projected_gravity"', '"projected_gravity", frame = "world"', "frame is world, valid: base"),
+    "no velocity": (
+        '"projected_gravity"',
+        '"velocity_commands"',
+        "value is empty, valid: numbers, or a table",
+    ),
+    "follower": ("[action]", "[follower]\n[action]", "follower is given, valid: a term `velocity_commands`"),
+    "follower's gain": (
+        "[action]",
+        "[follower]\ngain = -1.0\n[action]",
+        "follower.gain is -1.0, valid: 0 or",
+    ),
     "period": (
         'name = "plain"',
         'control_period = 0.0\nname = "plain"',

@@ -113,6 +113,19 @@ def test_arm_kinematics_are_mujoco_s(config: RobotConfig) -> None:
         np.testing.assert_allclose(rot[i].ravel(), data.site("tcp").xmat, atol=1e-12)
 
 
+def test_the_arm_s_jacobian_is_that_of_finite_differences() -> None:
+    arm, rng, h = ArmKinematics(load_robot()), np.random.default_rng(0), 1e-6
+    q = rng.uniform(-1.0, 1.0, (5, 6))
+    _, rot, jacobian = arm.pose_and_jacobian(q)
+    for k in range(6):
+        step = h * np.eye(6)[k]
+        (p1, r1), (p0, r0) = arm.pose(q + step), arm.pose(q - step)
+        np.testing.assert_allclose((p1 - p0) / (2 * h), jacobian[:, :3, k], atol=1e-8)
+        turn = (r1 - r0) / (2 * h) @ np.swapaxes(rot, 1, 2)
+        axis = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+        np.testing.assert_allclose(axis, jacobian[:, 3:, k], atol=1e-8)
+
+
 def test_mjcf_export_keeps_the_motor() -> None:
     from wbc_bench.robot import build_spec
 

@@ -58,6 +58,14 @@ class ActionCard(Part, frozen=True):
     others: str = "hold"  # who drives the other joints: `hold`, or the spec of a controller
 
 
+class FollowerCard(Part, frozen=True):
+    """How a target becomes the velocity commands of a walking policy, see `wbc_bench.policies.follower`."""
+
+    gain: float = 1.0  # [1/s] velocity for each metre or radian that is left
+    limits: tuple[float, float, float] = (0.5, 0.3, 0.6)  # [m/s], [m/s], [rad/s] largest of (vx, vy, wz)
+    tolerance: tuple[float, float] = (0.03, 0.05)  # [m], [rad] errors that are left alone
+
+
 class PolicyCard(Part, frozen=True):
     """A policy."""
 
@@ -65,6 +73,7 @@ class PolicyCard(Part, frozen=True):
     observation: tuple[GroupCard, ...]
     network: tuple[NetworkCard, ...]
     action: ActionCard = ActionCard()
+    follower: FollowerCard | None = None
     source: str = ""
     robot: str = ""  # variant that it was made for; any when empty
     tcp: str = ""  # tool frame that it was made for; the robot's when empty
@@ -145,6 +154,22 @@ def check_card(card: PolicyCard, where: str) -> None:
             refuse(f"action.{part}", value, "0 or more")
     if not 0 < action.filter <= 1:
         refuse("action.filter", action.filter, "above 0, at most 1")
+    follower = card.follower
+    if follower is not None:
+        for part, values in (
+            ("gain", (follower.gain,)),
+            ("limits", follower.limits),
+            ("tolerance", follower.tolerance),
+        ):
+            finite(f"follower.{part}", values)
+            if min(values) < 0:
+                refuse(f"follower.{part}", getattr(follower, part), "0 or more")
+    terms = [term for group in card.observation for term in group.terms]
+    follows = any(term.term == "velocity_commands" and not term.value for term in terms)
+    if follows and follower is None:
+        refuse("velocity_commands.value", "empty", "numbers, or a table [follower]")
+    if follower is not None and not follows:
+        refuse("follower", "given", "a term `velocity_commands` without `value`, which reads it")
     if not card.network:
         refuse("network", "empty", "at least one file")
     _check_flow(card, where)

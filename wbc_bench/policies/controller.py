@@ -1,5 +1,6 @@
 """A policy of a card as a controller: observations in, networks, joint commands out."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,14 @@ from wbc_bench.controller import (
     ControllerInfo,
     JointCommand,
     Observation,
+    ProtocolAware,
     Signal,
     Target,
 )
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.errors import ControllerError
 from wbc_bench.policies.card import PolicyCard, check_card, read_card
+from wbc_bench.policies.follower import Follower
 from wbc_bench.policies.observations import Group, numbers
 from wbc_bench.policies.onnx_network import OnnxNetwork
 from wbc_bench.policies.terms import Seen
@@ -68,6 +71,10 @@ class CardController:
             raise ControllerError(
                 f"{where}: 'action' has {widths['action']} numbers, it drives {size} joints"
             )
+        follower = card.follower
+        self._follower = None
+        if follower is not None:
+            self._follower = Follower(robot, follower.gain, follower.limits, follower.tolerance)
         self._others: Controller | None = None
         if action.others != "hold":
             self._others = load_controller(action.others, robot)
@@ -101,6 +108,8 @@ class CardController:
     def prepare(self, protocol: EvalProtocol) -> None:
         """Take the decay of the reference from a protocol."""
         self._decay = protocol.reference_decay
+        if isinstance(self._others, ProtocolAware):
+            self._others.prepare(protocol)
 
     def reset(self, episodes: NDArray[np.int64], obs: Observation, target: Target) -> None:
         """Forget history and states."""
@@ -115,6 +124,8 @@ class CardController:
             # Source: paper, eq. rfm_phase, first line
             self._reference = 2 * np.linalg.norm(seen.ee_pos_b - seen.target_pos_b, axis=1)
             self._reference += geodesic_angle(seen.ee_rot_b, seen.target_rot_b)
+        if self._follower is not None:
+            self._follower.start(*self._seen(obs, target).in_frame(*target, "heading"))
         if self._others is not None:
             self._others.reset(episodes, obs, target)
 
@@ -125,6 +136,8 @@ class CardController:
             self._reference = np.maximum(decayed, 0.0)
         self._steps += 1
         seen = self._seen(obs, target)
+        if self._follower is not None:
+            seen = replace(seen, velocity=self._follower.command(*seen.in_frame(*target, "heading")))
         self.values = {group.name: group.compute(seen) for group in self.groups}
         for network in self.networks:
             self.values |= network(self.values)

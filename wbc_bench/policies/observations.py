@@ -30,6 +30,8 @@ class Column:
             size = actions
         elif card.term == "gait_phase":
             size = 2 * len(card.phases)
+        elif self.follows:
+            size = 3
         elif size is None:
             size = len(card.value)
             if not size:
@@ -41,12 +43,17 @@ class Column:
         )
 
     @property
+    def follows(self) -> bool:
+        """Whether it is what the card's follower commands."""
+        return self.card.term == "velocity_commands" and not self.card.value
+
+    @property
     def signals(self) -> set[Signal]:
         """What it reads."""
         needed = set(self._term.signals)
         if self._term.kind == "pose" and self.card.frame == "world":
             needed.add("base_pose")
-        if self.card.frame == "heading":
+        if self.card.frame == "heading" or self.follows:
             needed.add("proprioception")
         return needed
 

@@ -18,7 +18,7 @@ PICKLED = (b"PK\x03\x04", b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")  #
 class OnnxNetwork:
     """One graph with the state that it hands to itself.
 
-    A graph that was exported for a batch of one is run row by row.
+    A graph that was exported for a batch of one, or for vectors without a batch axis, is run row by row.
     """
 
     def __init__(self, card: NetworkCard, folder: Path, widths: dict[str, int], where: str) -> None:
@@ -89,10 +89,10 @@ class OnnxNetwork:
         """Outputs (N, ...) of rows (N, width)."""
         states, given = {state.input: state for state in self.card.state}, {}
         for name, array in rows.items():
-            shape = self._shapes[name]
-            shaped = array.reshape(len(array), *shape)
+            shaped = array.reshape(len(array), *self._shapes[name])
             axis = states[name].batch_axis if name in states else 0
-            given[name] = np.ascontiguousarray(np.moveaxis(shaped, 0, axis), dtype=np.float32)
+            shaped = shaped[0] if _is_vector(self._inputs[name]) else np.moveaxis(shaped, 0, axis)
+            given[name] = np.ascontiguousarray(shaped, dtype=np.float32)
         try:
             found = self._session.run(names, given)
         except Exception as error:  # onnxruntime has exceptions of its own
@@ -122,9 +122,10 @@ class OnnxNetwork:
                 f"'{name}' has shape {value.shape} and `batch_axis` is {axis}", "an axis that it has"
             )
         batch = value.shape[axis] if value.shape else None
-        if isinstance(batch, int) and batch != 1:
+        vector = _is_vector(value)
+        if isinstance(batch, int) and batch != 1 and not vector:
             self._refuse(f"input '{name}' is made for {batch} robots", "a variable batch, or one of 1")
-        rest = [size for k, size in enumerate(value.shape) if k != axis]
+        rest = [size for k, size in enumerate(value.shape) if k != axis or vector]
         if (
             not all(isinstance(size, int) and size > 0 for size in rest)
             or np.prod(rest, dtype=float) > LARGEST
@@ -137,7 +138,8 @@ class OnnxNetwork:
 
     def _width_of(self, output: str) -> int:
         """Columns of an output; 0 where the graph does not say."""
-        rest = self._outputs[output].shape[1:]
+        value = self._outputs[output]
+        rest = value.shape if _is_vector(value) else value.shape[1:]
         return int(np.prod(rest)) if all(isinstance(size, int) for size in rest) else 0
 
     def _check_width(self, name: str, widths: dict[str, int]) -> None:
@@ -158,6 +160,11 @@ class OnnxNetwork:
 
     def _refuse(self, problem: str, valid: str) -> None:
         raise ControllerError(f"{self._where} {problem}, valid: {valid}")
+
+
+def _is_vector(value) -> bool:
+    """Whether an input or output of a graph is that of one robot, without a batch axis."""
+    return len(value.shape) == 1 and isinstance(value.shape[0], int)
 
 
 def open_session(path: Path):

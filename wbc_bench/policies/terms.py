@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wbc_bench.controller import Signal
-from wbc_bench.rotations import rotvec_from_matrix, wxyz_from_matrix
+from wbc_bench.rotations import heading_from_gravity, rotvec_from_matrix, wxyz_from_matrix
 
 Array = NDArray[np.float64]
 Kind = Literal["vector", "joints", "pose", "plain"]
@@ -40,7 +40,7 @@ class TermCard(Part, frozen=True):
     offset: Numbers = 0.0
     clip: tuple[float, float] | None = None
     history: int = 0  # frames; the group's when 0
-    value: tuple[float, ...] = ()  # of `constant` and `velocity_commands`
+    value: tuple[float, ...] = ()  # of `constant`, and of `velocity_commands` where no follower gives them
     frequency: float = 1.0  # [Hz] of `gait_phase`
     phases: tuple[float, ...] = (0.0,)  # of `gait_phase`, one per leg, in turns
 
@@ -62,14 +62,11 @@ class Seen:
     phase_reference: Array  # (N,)
     arm_mount_b: Array  # (3,) [m]
     quaternion: str
+    velocity: Any = None  # (N, 3) [m/s, m/s, rad/s] of the follower
 
     def heading(self) -> Array:
         """(N, 3, 3) the base in the frame that has its heading and is level, from the measured gravity."""
-        up = -self.proprioception.gravity_b
-        up = up / np.linalg.norm(up, axis=1, keepdims=True)
-        x = np.array([1.0, 0.0, 0.0]) - up * up[:, :1]
-        x /= np.linalg.norm(x, axis=1, keepdims=True)
-        return np.stack([x, np.cross(up, x), up], axis=1)
+        return heading_from_gravity(self.proprioception.gravity_b)
 
     def in_frame(self, pos: Array, rot: Array, frame: str) -> tuple[Array, Array]:
         """A pose of the base frame in another frame."""
@@ -242,9 +239,9 @@ TERMS: dict[str, Term] = {
         "plain",
         None,
         "m/s, rad/s",
-        "a constant command, `value`; a walking policy's (vx, vy, wz)",
+        "a walking policy's (vx, vy, wz) in the heading frame, of the follower, or the constant `value`",
         (),
-        lambda s, c: _ones(s) * np.array(c.value),
+        lambda s, c: _ones(s) * np.array(c.value) if c.value else s.velocity,
     ),
     "constant": Term(
         "plain", None, "1", "the numbers of `value`", (), lambda s, c: _ones(s) * np.array(c.value)

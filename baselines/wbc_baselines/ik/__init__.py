@@ -2,18 +2,20 @@
 
 Variants: `ik` (all episodes of a shard at once, their programs solved by DAQP), `ik:placo` and `ik:osqp` (the
 same program in PlaCo, and on Pinocchio and OSQP, an episode at a time), `ik:kinematic` (without feed-forward
-and feedback: what is left is the whole-body IK alone) and `ik:standing` (never lifts a foot).
+and feedback: what is left is the whole-body IK alone), `ik:standing` (never lifts a foot) and `ik:arm` (the
+arm alone, on legs that hold their posture or that another controller moves).
 """
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from wbc_baselines.ik.arm_only import ArmController
 from wbc_baselines.ik.config import TUNED, TUNED_FOR
 from wbc_bench.errors import ControllerError, UnknownNameError, missing_extra
 from wbc_bench.robot import Robot
 
 if TYPE_CHECKING:
-    from wbc_baselines.ik.controller import IKController
+    from wbc_bench.controller import Controller
 
 CHANGES: dict[str, dict[str, bool]] = {  # to the tuned configuration
     "": {},
@@ -23,19 +25,21 @@ CHANGES: dict[str, dict[str, bool]] = {  # to the tuned configuration
     "standing": {"stepping": False},
 }
 DESCRIPTIONS = {
+    "arm": "The arm's inverse kinematics alone: the legs hold the default posture.",
     "": "Whole-body inverse kinematics that takes steps; its quadratic program is solved by DAQP.",
     "kinematic": "The inverse kinematics alone: no feed-forward, no feedback, no steps.",
     "osqp": "The same quadratic program as `ik`, on Pinocchio and OSQP.",
     "placo": "The same quadratic program as `ik`, in PlaCo.",
     "standing": "As `ik`, but no foot is ever lifted.",
 }
-VARIANTS = tuple(CHANGES)
+ARM = "arm"
+VARIANTS = (ARM, *CHANGES)
 
 
 class IK:
     """The entry point of the inverse-kinematics controllers."""
 
-    def __call__(self, robot: Robot, variant: str = "") -> "IKController":
+    def __call__(self, robot: Robot, variant: str = "") -> "Controller":
         """Create the controller of a variant.
 
         Raises:
@@ -43,7 +47,9 @@ class IK:
             ControllerError: A solver is not installed.
         """
         if variant not in VARIANTS:
-            raise UnknownNameError("variant of ik", variant, VARIANTS[1:], "--controller")
+            raise UnknownNameError("variant of ik", variant, filter(None, VARIANTS), "--controller")
+        if variant == ARM:
+            return ArmController(robot)
         config = replace(TUNED_FOR.get(robot.config.variant, TUNED), **CHANGES[variant])
         name = f"ik:{variant}" if variant else "ik"
         # imported here: each solver is needed only by its own variant
