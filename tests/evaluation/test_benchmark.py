@@ -30,13 +30,18 @@ def clocks(monkeypatch: pytest.MonkeyPatch, ticks: Iterator[float]) -> None:
 
 def test_the_physics_is_timed_inside_the_evaluation(small: str, monkeypatch: pytest.MonkeyPatch) -> None:
     clocks(monkeypatch, (float(reading) for reading in count()))
-    row = harness_share("hold", small).iloc[0]
+    row = harness_share(["hold"], small).iloc[0]
     # a second between two readings: one in each call of the engine, one before it, and one at the end
     assert row["physics (s)"] > 0 and row["evaluation (s)"] == 2 * row["physics (s)"] + 2
 
 
 def test_no_share_is_above_one(small: str, monkeypatch: pytest.MonkeyPatch) -> None:
     clocks(monkeypatch, iter(process_time, None))
-    row = harness_share("hold", small).iloc[0]
+    row = harness_share(["hold"], small).iloc[0]
     lowest, whole, highest = row[SHARES]
     assert 0 < lowest <= whole <= highest <= 1 and row["control steps"] > 0
+
+
+def test_a_controller_that_cannot_be_made_has_no_row(small: str) -> None:
+    frame = harness_share(["hold", "learned:no_such_file.safetensors"], small)
+    assert list(frame["controller"]) == ["hold"] and len(frame.columns) == 7
