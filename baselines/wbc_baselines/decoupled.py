@@ -32,6 +32,7 @@ class DecoupledController:
         self._policy, self._arm = policy, ArmController(robot)
         self._follower = Follower(robot, GAIN, LIMITS, TOLERANCE)
         signals = policy.info.signals | self._arm.info.signals | {"ee_pose"}
+        self.checkpoint_sha256 = getattr(policy, "checkpoint_sha256", None)
         self.info = policy.info._replace(name=name, signals=signals, source="wbc_baselines.decoupled")
 
     def prepare(self, protocol: EvalProtocol) -> None:
