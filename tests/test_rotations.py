@@ -125,3 +125,14 @@ def test_any_batch_shape() -> None:
     assert rho6(grid).shape == (4, 50, 6)
     assert geodesic_angle(grid, ROT[0]).shape == (4, 50)
     assert rotvec_from_matrix(ROT[0]).shape == (3,)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_matrix_that_is_not_finite_spoils_no_other(value: float) -> None:
+    spoilt = ROT.copy()
+    spoilt[1, 0, 2] = value
+    for inverse in (wxyz_from_matrix, rotvec_from_matrix):
+        found, expected = inverse(spoilt), inverse(ROT)
+        assert np.isnan(found[1]).all()
+        np.testing.assert_array_equal(np.delete(found, 1, axis=0), np.delete(expected, 1, axis=0))
+    assert np.isnan(wxyz_from_matrix(np.full((3, 3), value))).all()

@@ -28,9 +28,11 @@ def matrix_from_wxyz(quat: Array) -> Array:
 def wxyz_from_matrix(rot: Array) -> Array:
     """Unit quaternions (..., 4), scalar first and non-negative, of rotation matrices (..., 3, 3).
 
+    A matrix that is not finite, e.g. of a simulation that diverged, has NaN and spoils no other.
     Source: Bar-Itzhack 2000 (largest eigenvector), exact for every angle.
     """
-    m = rot
+    finite: NDArray[np.bool_] = np.isfinite(rot).all(axis=(-2, -1), keepdims=True)
+    m = np.where(finite, rot, np.eye(3))
     k = np.empty((*rot.shape[:-2], 4, 4))
     k[..., 0, 0] = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     k[..., 1, 1] = m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2]
@@ -43,7 +45,7 @@ def wxyz_from_matrix(rot: Array) -> Array:
     k[..., 1, 3] = k[..., 3, 1] = m[..., 0, 2] + m[..., 2, 0]
     k[..., 2, 3] = k[..., 3, 2] = m[..., 2, 1] + m[..., 1, 2]
     quat = np.linalg.eigh(k)[1][..., :, 3]
-    return np.where(quat[..., :1] < 0, -quat, quat)
+    return np.where(finite[..., 0], np.where(quat[..., :1] < 0, -quat, quat), np.nan)
 
 
 def xyzw_from_wxyz(quat: Array) -> Array:

@@ -49,3 +49,17 @@ def test_out_of_reach_it_waits_in_its_default_posture() -> None:
     far = Target(np.array([[2.0, 0.0, 0.3]]), np.eye(3)[None])
     last = follow(far, 4.0, np.zeros(6))
     np.testing.assert_allclose(last, ROBOT.default_q[None], atol=1e-6)
+
+
+def test_a_simulation_that_diverged_spoils_no_other() -> None:
+    arm = ArmKinematics(ROBOT)
+    pos, rot = arm.pose(np.tile(ROBOT.default_q[8:] + 0.1, (3, 1)))
+    pos[1], rot[1] = np.nan, np.nan
+    q = np.tile(ROBOT.default_q, (3, 1))
+    q[1, 9] = np.nan
+    controller, alone = ArmController(ROBOT), ArmController(ROBOT)
+    controller.reset(np.arange(3), seen(q), Target(pos, rot))
+    alone.reset(np.arange(1), seen(q[:1]), Target(pos[:1], rot[:1]))
+    for _ in range(3):
+        command = controller.act(seen(q), Target(pos, rot)).q
+        np.testing.assert_array_equal(command[[0]], alone.act(seen(q[:1]), Target(pos[:1], rot[:1])).q)
