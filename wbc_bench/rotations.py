@@ -31,7 +31,7 @@ def wxyz_from_matrix(rot: Array) -> Array:
     A matrix that is not finite, e.g. of a simulation that diverged, has NaN and spoils no other.
     Source: Bar-Itzhack 2000 (largest eigenvector), exact for every angle.
     """
-    finite: NDArray[np.bool_] = np.isfinite(rot).all(axis=(-2, -1), keepdims=True)
+    finite = np.asarray(np.isfinite(rot).all(axis=(-2, -1), keepdims=True))
     m = np.where(finite, rot, np.eye(3))
     k = np.empty((*rot.shape[:-2], 4, 4))
     k[..., 0, 0] = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
