@@ -39,7 +39,8 @@ def main() -> int:
     for k in range(len(loaded)):
         frame = loaded[k]
         for name, column in table.items():
-            worst = max(worst, float(np.abs(np.asarray(frame[name]) - np.asarray(column[k])).max()))
+            apart = np.abs(np.asarray(frame[name], dtype=float) - np.asarray(column[k], dtype=float)).max()
+            worst = float(np.fmax(worst, np.nan_to_num(apart, nan=np.inf)))
     ok = len(loaded) == len(table["index"]) and worst < 1e-6
     print(
         f"LeRobot {loaded.meta.info['codebase_version']}: {loaded.num_episodes} episodes, "

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from policies import networks, write
 from wbc_baselines.learned.policy import checkpoint, weights
+from wbc_baselines.learned.policy.average import average
 from wbc_baselines.learned.policy.card import FORMAT, CheckpointError, check_fit, read_card
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_bench.episodes.protocol import find_protocol
@@ -236,3 +237,31 @@ def test_a_method_stands_for_one_seed_a_replicate():
     assert spec_of_replicate("learned:gru", 2) == "learned:gru@2"
     for spec in ("learned:gru@1", "learned:some/gru.safetensors", "hold", "module:attribute"):
         assert spec_of_replicate(spec, 2) == spec
+
+
+def test_average_is_the_mean_of_weights(tmp_path: Path) -> None:
+    paths = [write(tmp_path / str(seed), "transformer_gru", seed=seed) for seed in (1, 2)]
+    for path, samples in zip(paths, (10, 30), strict=True):
+        edit(path, samples=samples, seed=1)
+    out = tmp_path / "mean.safetensors"
+    average([*paths, paths[1]], out)
+    parts, found = [load_file(path) for path in paths], load_file(out)
+    for name, value in found.items():
+        expected = (parts[0][name].double() + 2 * parts[1][name].double()) / 3
+        torch.testing.assert_close(value, expected.float(), rtol=0, atol=1e-7)
+    card = read_card(out)
+    cards = [read_card(path) for path in paths]
+    assert card.mean_of == tuple(f"{c.samples} {c.sha256}" for c in (*cards, cards[1]))
+    assert card.samples == max(c.samples for c in cards)
+    load_controller(f"learned:{out}", load_robot())
+
+
+def test_average_refuses_what_does_not_belong_together(tmp_path: Path, sound: Path) -> None:
+    other = write(tmp_path / "other", "gru", seed=3)
+    with pytest.raises(
+        CheckpointError, match=r"gru@3.safetensors' has the method gru, valid: that of .*cenet"
+    ):
+        average([sound, other], tmp_path / "mean.safetensors")
+    with pytest.raises(CheckpointError, match="average of 1 checkpoints, valid: 2 or more"):
+        average([sound], tmp_path / "mean.safetensors")
+    assert not (tmp_path / "mean.safetensors").exists()

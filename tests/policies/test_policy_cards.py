@@ -7,9 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 from conftest import CalmRows
+from onnx import helper
 
 import wbc_bench
-from small_networks import layer, recurrent, weights
+from small_networks import layer, recurrent, weights, write
 from tiny_protocol import write_tiny
 from wbc_bench.cli.main import main
 from wbc_bench.controller import Controller, ControllerInfo, JointCommand, Observation, Signal, Target
@@ -413,6 +414,26 @@ def test_a_wrong_card_is_one_line(tmp_path: Path, mistake: str, capsys: pytest.C
         main(["eval", "--controller", spec, "--protocol", "smoke_v1", "--out", str(tmp_path / "out")])
     assert ended.value.code == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1 and not (tmp_path / "out").exists()
+
+
+def test_one_output_for_all_robots_is_refused(tmp_path: Path) -> None:
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["product"]),
+        helper.make_node("ReduceMean", ["product"], ["actions"], axes=[0], keepdims=0),
+    ]
+    shapes = {"obs": ["batch", 3]}, {"actions": [14]}
+    write(tmp_path / "net.onnx", nodes, *shapes, {"w": weights(0, 3, 14)})
+    with pytest.raises(
+        ControllerError, match=r"'actions' has shape \[14\] for all robots, valid: a row for each"
+    ):
+        load_controller(card(tmp_path, PLAIN), ROBOT)
+
+
+def test_others_of_another_period_are_refused(tmp_path: Path) -> None:
+    layer(tmp_path / "net.onnx", weights(5, 5, 8))
+    text = WALKER.replace("LEGS", str(list(LEGS)))
+    with pytest.raises(ControllerError, match=r"'ik:arm' runs every 0.02 s, the card every 0.04 s"):
+        load_controller(card(tmp_path, "control_period = 0.04" + text), ROBOT)
 
 
 @pytest.mark.parametrize("content", ["pickle", "torch", "cut", "text"])

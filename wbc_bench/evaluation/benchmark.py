@@ -38,8 +38,10 @@ def harness_share(
     times: dict[str, list[tuple[int, float, float]]] = {}
     for controller in controllers:
         with suppress(BenchError):
-            _times(controller, protocol, manifest.take(slice(2)))  # imports and first calls are not counted
+            load_controller(controller, load_robot(protocol.robot))
             times[controller] = []
+    for controller in times:
+        _times(controller, protocol, manifest.take(slice(2)))  # imports and first calls are not counted
     for k in range(SHARDS):
         rows = manifest.take(slice(k * SHARD_EPISODES, (k + 1) * SHARD_EPISODES))
         for controller, found in times.items():

@@ -78,6 +78,12 @@ class CardController:
         self._others: Controller | None = None
         if action.others != "hold":
             self._others = load_controller(action.others, robot)
+            period = self._others.info.control_period
+            if abs(period - card.control_period) > 1e-9:
+                raise ControllerError(
+                    f"{where}: action.others '{action.others}' runs every {period:g} s, the card every "
+                    f"{card.control_period:g} s, valid: equal periods"
+                )
         signals: set[Signal] = {
             signal for group in self.groups for column in group.columns for signal in column.signals
         }

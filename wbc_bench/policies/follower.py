@@ -13,7 +13,7 @@ BEARINGS = np.arange(-150, 181, 30) * np.pi / 180  # [rad] of the mount as it is
 REACHED = 0.01, 0.05  # [m], [rad] a posture of the arm that comes so near reaches
 STEPS, DAMPING = 40, 0.05  # of the arm's inverse kinematics
 TURNING = 0.3  # [m/rad] what a turn costs beside the way
-# [1] what errors that stay cost beside the way: stances that do not reach come after all that do
+# [1] what errors beyond REACHED cost beside the way: 1 cm as much as a way of 1 m
 UNREACHED = 100.0
 
 
@@ -22,9 +22,9 @@ class Follower:
 
     At the start of an episode it chooses, for each robot, a stance: a place of the level base at its present
     height, facing the target, from which the arm's inverse kinematics reaches the target's pose. Where it
-    stands is one of the candidates; of those that reach, the one with the shortest way is taken, and where
-    none does, the one that comes nearest. The stance is kept as the base's pose seen from the target, so that
-    no odometry is needed.
+    stands is one of the candidates; the one with the shortest way is taken, on which each centimetre or
+    hundredth of a radian that the arm stays short counts a metre. The stance is kept as the base's pose seen
+    from the target, so that no odometry is needed; it suits one target that stays where it is in the world.
     """
 
     def __init__(

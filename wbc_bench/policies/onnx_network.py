@@ -39,6 +39,7 @@ class OnnxNetwork:
         self._shapes = {name: self._shape(name, axis) for name, axis in axes.items()}
         fixed = [name for name, axis in axes.items() if isinstance(self._inputs[name].shape[axis], int)]
         self._by_row = bool(fixed)
+        self._check_outputs()
         for name in card.inputs:
             self._check_width(name, widths)
         for state in card.state:
@@ -151,6 +152,27 @@ class OnnxNetwork:
                 f"{self._where} reads {self._size(name)} numbers as '{name}', the card gives "
                 f"{sum(parts.values())}: {told}"
             )
+
+    def _check_outputs(self) -> None:
+        """Refuse outputs that are not one row for each robot. Raises: ControllerError."""
+        axes = [(name, 0) for name in self.card.outputs]
+        axes += [(state.output, state.batch_axis) for state in self.card.state]
+        for name, axis in axes:
+            value = self._outputs[name]
+            if axis >= len(value.shape):
+                self._refuse(f"output '{name}' has shape {value.shape}", f"one with a batch on axis {axis}")
+            if _is_vector(value) and not self._by_row:
+                self._refuse(
+                    f"output '{name}' has shape {value.shape} for all robots", "a row for each, as the inputs"
+                )
+        for state in self.card.state:
+            given, wanted = self._outputs[state.output].shape, self._inputs[state.input].shape
+            known = [one for one in (given, wanted) if all(isinstance(size, int) for size in one)]
+            if len(known) == 2 and np.prod(given, dtype=float) != np.prod(wanted, dtype=float):
+                self._refuse(
+                    f"state '{state.input}' has shape {wanted}, its output '{state.output}' {given}",
+                    "equal shapes",
+                )
 
     def _same_names(self, what: str, given: list[str], wanted: list[str]) -> None:
         if sorted(given) != sorted(wanted):

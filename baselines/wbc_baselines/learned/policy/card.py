@@ -81,6 +81,8 @@ class PolicyCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     init_checkpoint: str = msgspec.field(default="", name="start")
     teacher: str = ""
     sha256: str = ""  # of the safetensors file
+    # control steps and SHA-256 of the checkpoints whose mean it is, see `average`
+    mean_of: tuple[str, ...] = ()
 
 
 def robot_facts(robot: Robot, control_period: float) -> RobotFacts:

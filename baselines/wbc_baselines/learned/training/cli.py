@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 from msgspec.structs import replace
-from tyro.conf import OmitArgPrefixes, subcommand
+from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from wbc_baselines.learned.training.config import TrainConfig, TrainingError
 from wbc_bench.cli.common import run_command
@@ -256,6 +256,26 @@ class Dagger:
 
 
 @dataclass(frozen=True)
+class Average:
+    """Average the weights of checkpoints of one training, which is better than each of them late in a run."""
+
+    paths: Annotated[tuple[Path, ...], Positional]
+    """Checkpoints, each a PATH.safetensors with its card beside it; one given twice counts twice."""
+    out: Annotated[Path, arg(aliases=("-o",))]
+    """File to write, PATH.safetensors."""
+
+    def run(self) -> None:
+        from wbc_baselines.learned.policy.average import average
+        from wbc_bench.files import ensure_file_writable
+
+        if self.out.suffix != ".safetensors":
+            raise TrainingError(f"--out '{self.out}': valid: a name that ends in .safetensors")
+        ensure_file_writable(self.out)
+        average(self.paths, self.out)
+        print(self.out)
+
+
+@dataclass(frozen=True)
 class Targets:
     """Generate the feasible targets that training picks from (12,000 take five minutes on two cores)."""
 
@@ -294,6 +314,7 @@ Command = (
     | Annotated[Bench, subcommand("bench")]
     | Annotated[Dagger, subcommand("dagger")]
     | Annotated[Targets, subcommand("targets")]
+    | Annotated[Average, subcommand("average")]
 )
 
 
