@@ -1,6 +1,7 @@
 """The command line of training, `wbc-train COMMAND --help`."""
 
 import dataclasses
+import math
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -31,14 +32,19 @@ class Run:
     """Whether to continue a run with settings other than those it was started with, for example another
     --num-envs, --backend or schedule. New episodes are begun, and the changes are recorded in the run's
     changes.jsonl."""
+    keep_every: float = 0.0
+    """Control steps between two checkpoints that no later one replaces, for `wbc-train average`; 0 for
+    none."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.run_folder import RunFolder, run
         from wbc_bench.progress import Progress
 
+        if not 0 <= self.keep_every < math.inf:
+            raise TrainingError(f"--keep-every {self.keep_every:g}: valid: 0 or more control steps")
         folder = RunFolder(self.out / self.config.name)
         with Progress("steps") as progress:
-            run(self.config, folder, progress.update, change=self.change)
+            run(self.config, folder, progress.update, change=self.change, keep_every=self.keep_every)
         print(folder.path)
 
 

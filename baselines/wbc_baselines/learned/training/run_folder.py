@@ -64,6 +64,10 @@ class RunFolder:
         """Checkpoint for an evaluation, `learned:PATH`, written together with the resume file."""
         return self.path / f"{self.path.name}.safetensors"
 
+    def kept(self, samples: int) -> Path:
+        """Checkpoint after so many control steps that no later one replaces, for `average`."""
+        return self.path / "kept" / f"{self.path.name}.{samples}.safetensors"
+
     @property
     def claim(self) -> Path:
         """Host and process that trains the run."""
@@ -266,6 +270,7 @@ def run(
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     tensorboard: bool = True,
     change: bool = False,
+    keep_every: float = 0.0,
 ) -> None:
     """Train up to the budget, from the folder's resume file if there is one, and write the final checkpoint.
 
@@ -275,6 +280,7 @@ def run(
         progress: Is called with completed and total control steps and a line of text.
         tensorboard: Whether to write the metrics for TensorBoard as well.
         change: Whether a run that was started with other settings is continued with these, in new episodes.
+        keep_every: Control steps between two checkpoints that are kept; 0 for none.
 
     Raises:
         TrainingError: See `RunFolder.open`, `load_resume` and `Trainer.iterate`; or another process is
@@ -306,6 +312,8 @@ def run(
                 if writer:
                     for name, value in metrics.items():
                         writer.add_scalar(name, value, trainer.samples)
+                if keep_every and trainer.samples % keep_every < per_iteration:
+                    trainer.write_checkpoint(folder.kept(trainer.samples), seconds)
                 progress(trainer.samples - first, int(config.budget) - first, line(trainer, metrics, rate))
                 if stop or trainer.done or time.monotonic() - saved > CHECKPOINT_PERIOD:
                     save_resume(trainer, folder, seconds)
