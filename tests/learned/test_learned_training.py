@@ -23,6 +23,7 @@ from tensordict import TensorDict
 from trainers import STEPS, TINY, assert_equal, trainer
 from training_targets import TARGETS, manifest_of
 from wbc_baselines.learned.policy import checkpoint
+from wbc_baselines.learned.policy.average import average
 from wbc_baselines.learned.policy.estimators.latent import LatentEstimator
 from wbc_baselines.learned.policy.methods import METHODS
 from wbc_baselines.learned.training import run_folder as runs
@@ -334,6 +335,17 @@ def test_a_run_leaves_metrics_and_goes_on(tmp_path):
     assert checkpoint.load(folder.checkpoint).card.samples == 192
     with pytest.raises(TrainingError, match=r"gamma 0\.99 -> 0\.9"):
         run(replace(config, gamma=0.9), folder)
+
+
+def test_checkpoints_that_are_kept_can_be_averaged(tmp_path):
+    folder = RunFolder(tmp_path / TINY.name)
+    run(replace(TINY, budget=4 * 48), folder, tensorboard=False, keep_every=2 * 48)
+    kept = [folder.kept(samples) for samples in (96, 192)]
+    assert sorted(folder.path.glob("kept/*.safetensors")) == sorted(kept)
+    assert [checkpoint.load(path).card.samples for path in kept] == [96, 192]
+    assert kept[1].read_bytes() == folder.checkpoint.read_bytes()
+    average(kept, tmp_path / "mean.safetensors")
+    assert len(checkpoint.load(tmp_path / "mean.safetensors").card.mean_of) == 2
 
 
 def test_a_killed_run_resumes(tmp_path):

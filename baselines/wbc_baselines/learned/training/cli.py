@@ -33,8 +33,8 @@ class Run:
     --num-envs, --backend or schedule. New episodes are begun, and the changes are recorded in the run's
     changes.jsonl."""
     keep_every: float = 0.0
-    """Control steps between two checkpoints that no later one replaces, for `wbc-train average`; 0 for
-    none."""
+    """Number of control steps between two checkpoints that no later one replaces, see `wbc-train average`;
+    0 for none."""
 
     def run(self) -> None:
         from wbc_baselines.learned.training.run_folder import RunFolder, run
