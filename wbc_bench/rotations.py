@@ -69,6 +69,16 @@ def matrix_from_rpy(rpy: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def yaw_matrix(yaw: Array | float) -> Array:
+    """Rotations (..., 3, 3) about the vertical by angles (...,) [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    rot = np.zeros((*np.shape(yaw), 3, 3))
+    rot[..., 0, 0] = rot[..., 1, 1] = c
+    rot[..., 1, 0], rot[..., 0, 1] = s, -s
+    rot[..., 2, 2] = 1.0
+    return rot
+
+
 def rpy_from_matrix(rot: Array) -> Array:
     """Roll, pitch, yaw (..., 3) [rad] of rotation matrices (..., 3, 3), pitch in [-pi/2, pi/2]. Source: URDF.
 

@@ -17,7 +17,7 @@ from wbc_bench.controller import Controller, JointCommand, Observation, Protocol
 from wbc_bench.episodes.protocol import EvalProtocol
 from wbc_bench.policies.follower import Follower
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
-from wbc_bench.rotations import heading_from_gravity, matrix_from_rho6, matrix_from_rpy
+from wbc_bench.rotations import heading_from_gravity, matrix_from_rho6, yaw_matrix
 
 Array = NDArray[np.float64]
 DEFAULT = "transformer_gru@0"
@@ -60,7 +60,7 @@ class DecoupledController:
         heading = _heading(obs)
         velocity = self._follower.command(_turned(heading, target.pos_b), heading @ target.rot_b)
         moved = LOOKAHEAD * velocity
-        turn = matrix_from_rpy(moved * np.array([0.0, 0.0, 1.0]))
+        turn = yaw_matrix(moved[:, 2])
         pos = _turned(turn, _turned(heading, obs.ee_pose.pos_b)) + moved * np.array([1.0, 1.0, 0.0])
         back = np.swapaxes(heading, 1, 2)
         return Target(_turned(back, pos), back @ turn @ heading @ matrix_from_rho6(obs.ee_pose.rot6_b))

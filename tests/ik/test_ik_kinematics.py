@@ -7,12 +7,13 @@ import pinocchio as pin
 import pytest
 from scipy.spatial import ConvexHull
 
-from wbc_baselines.ik.geometry import Pose, cross, log3, rotate, rotate_back, skew, turn, yaw_matrix
+from wbc_baselines.ik.geometry import Pose, cross, log3, rotate, rotate_back, skew, turn
 from wbc_baselines.ik.kinematics import GRAVITY, Configuration, Kinematics
 from wbc_baselines.ik.model import WholeBodyModel, configuration
 from wbc_baselines.ik.rows import Rows, on_part
 from wbc_baselines.ik.stance import Stance, half_planes
 from wbc_bench.robot import RobotConfig, load_robot
+from wbc_bench.rotations import yaw_matrix
 
 RNG = np.random.default_rng(0)
 TURNS = [0.0, 1e-9, 1e-5, 1e-4, 0.3, 1.6, 3.0, 3.1, np.pi - 1e-6]  # [rad]

@@ -9,7 +9,7 @@ from wbc_baselines.ik import make
 from wbc_baselines.ik.config import TUNED
 from wbc_baselines.ik.controller import PERIOD
 from wbc_baselines.ik.estimation import ComFilter
-from wbc_baselines.ik.geometry import Pose, yaw_matrix
+from wbc_baselines.ik.geometry import Pose
 from wbc_baselines.ik.kinematics import GRAVITY, Kinematics
 from wbc_baselines.ik.model import WholeBodyModel, configuration
 from wbc_baselines.ik.stance import Hull, Stance, base_from_sole
@@ -25,6 +25,7 @@ from wbc_bench.episodes.protocol import find_protocol
 from wbc_bench.evaluation.rollout import rollout
 from wbc_bench.outcomes import TERMINATED
 from wbc_bench.robot import load_robot
+from wbc_bench.rotations import yaw_matrix
 
 ROBOT = load_robot()
 MODEL = WholeBodyModel(ROBOT)

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
 from wbc_bench.robot.kinematics import ArmKinematics
-from wbc_bench.rotations import geodesic_angle, matrix_from_rpy
+from wbc_bench.rotations import geodesic_angle, yaw_matrix
 
 Array = NDArray[np.float64]
 DISTANCES = np.array([0.25, 0.35, 0.45, 0.55, 0.65])  # [m] from the arm's mount to the target, horizontal
@@ -54,7 +54,7 @@ class Follower:
         """
         place, yaw = self._candidates(pos_h)  # (N, K, 2) [m], (N, K) [rad]
         count, kinds = yaw.shape
-        turn = _turns(yaw)
+        turn = yaw_matrix(yaw)
         offset = pos_h[:, None] - np.concatenate([place, np.zeros((count, kinds, 1))], axis=2)
         pos = np.einsum("nkji,nkj->nki", turn, offset).reshape(-1, 3)
         rot = np.einsum("nkji,njl->nkil", turn, rot_h).reshape(-1, 3, 3)
@@ -81,13 +81,8 @@ class Follower:
         bearing, distance = (part.ravel() for part in np.meshgrid(BEARINGS, DISTANCES))
         mount = distance[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
         yaw = np.arctan2(-mount[:, 1], -mount[:, 0])  # faces the target
-        ahead = np.einsum("kij,j->ki", _turns(yaw)[:, :2, :2], self._arm.root[:2])
+        ahead = np.einsum("kij,j->ki", yaw_matrix(yaw)[:, :2, :2], self._arm.root[:2])
         place = pos_h[:, None, :2] + (mount - ahead)
         count = len(pos_h)
         place = np.concatenate([np.zeros((count, 1, 2)), place], axis=1)
         return place, np.tile(np.concatenate([[0.0], yaw]), (count, 1))
-
-
-def _turns(yaw: Array) -> Array:
-    """Rotations (..., 3, 3) about the vertical."""
-    return matrix_from_rpy(np.stack([np.zeros_like(yaw), np.zeros_like(yaw), yaw], axis=-1))

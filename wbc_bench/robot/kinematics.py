@@ -52,9 +52,7 @@ class ArmKinematics:
         """
         pos, rot, jacobian = self.pose_and_jacobian(q)
         error = np.concatenate([pos_b - pos, rotvec_from_matrix(rot_b @ np.swapaxes(rot, 1, 2))], axis=1)
-        transposed = np.swapaxes(jacobian, 1, 2)
-        gram = jacobian @ transposed + damping**2 * np.eye(6)
-        return (transposed @ np.linalg.solve(gram, error[..., None]))[..., 0]
+        return damped_step(np.swapaxes(jacobian, 1, 2), error, damping**2)
 
     def solve(self, q: Array, pos_b: Array, rot_b: Array, steps: int, damping: float) -> Array:
         """Joint positions (N, 6) [rad] within their limits, near `q`, that come close to poses.
@@ -70,3 +68,10 @@ class ArmKinematics:
             moved = np.clip(self.step(q, pos_b, rot_b, damping), -0.5, 0.5)
             q = np.clip(q + moved, self._lower, self._upper)
         return q
+
+
+def damped_step(transposed_jacobian: Array, error: Array, damping: float) -> Array:
+    """Damped least squares J^T (J J^T + d)^-1 e, (N, K), of Jacobians J^T (N, K, M) and errors (N, M)."""
+    gram = np.swapaxes(transposed_jacobian, -1, -2) @ transposed_jacobian + damping * np.eye(error.shape[1])
+    multipliers = np.linalg.solve(gram, error[..., None])
+    return (transposed_jacobian @ multipliers)[..., 0]

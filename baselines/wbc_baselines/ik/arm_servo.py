@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from wbc_baselines.ik.geometry import Pose, log3, rotate, transposed
 from wbc_baselines.ik.kinematics import TCP, Bodies, Kinematics
+from wbc_bench.robot.kinematics import damped_step
 
 Array = NDArray[np.float64]
 
@@ -29,10 +30,3 @@ def _arm_step(bodies: Bodies, hand_b: Pose, damping: float) -> Array:
     error = np.concatenate([hand_b.pos - bodies.pos[:, TCP], turning], axis=1)
     jacobian = np.concatenate([bodies.linear[:, 8:], bodies.axis[:, 8:]], axis=2)  # (N, 6, 6) transposed
     return damped_step(jacobian, error, damping**2)
-
-
-def damped_step(transposed_jacobian: Array, error: Array, damping: float) -> Array:
-    """Damped least squares J^T (J J^T + d)^-1 e, (N, K), of Jacobians J^T (N, K, M) and errors (N, M)."""
-    gram = transposed(transposed_jacobian) @ transposed_jacobian + damping * np.eye(error.shape[1])
-    multipliers = np.linalg.solve(gram, error[..., None])
-    return (transposed_jacobian @ multipliers)[..., 0]

@@ -21,7 +21,6 @@ from wbc_baselines.ik.geometry import (
     rotate,
     rotate_back,
     transposed,
-    yaw_matrix,
 )
 from wbc_baselines.ik.kinematics import GRAVITY, SOLES, TCP, Bodies, Configuration, Kinematics
 from wbc_baselines.ik.load import GainObserver, Payload
@@ -40,7 +39,7 @@ from wbc_baselines.ik.stepping import (
 )
 from wbc_bench.controller import ControllerInfo, JointCommand, Observation, Target
 from wbc_bench.robot import NUM_LEG_JOINTS, Robot
-from wbc_bench.rotations import matrix_from_rotvec
+from wbc_bench.rotations import matrix_from_rotvec, yaw_matrix
 
 Array = NDArray[np.float64]
 PERIOD = 0.02  # [s]

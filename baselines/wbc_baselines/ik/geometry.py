@@ -47,16 +47,6 @@ def norm(vectors: Array) -> Array:
     return np.sqrt(dot(vectors, vectors))
 
 
-def yaw_matrix(yaw: Array | float) -> Array:
-    """Rotations (..., 3, 3) about the vertical by angles (...,) [rad]."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    rot = np.zeros((*np.shape(yaw), 3, 3))
-    rot[..., 0, 0] = rot[..., 1, 1] = c
-    rot[..., 1, 0], rot[..., 0, 1] = s, -s
-    rot[..., 2, 2] = 1.0
-    return rot
-
-
 def skew(vectors: Array) -> Array:
     """Matrices (..., 3, 3) that multiply as the cross products with vectors (..., 3)."""
     out = np.zeros((*vectors.shape[:-1], 3, 3))

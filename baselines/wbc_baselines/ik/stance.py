@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.geometry import Pose, cross, dot, norm, rotate, yaw_matrix
+from wbc_baselines.ik.geometry import Pose, cross, dot, norm, rotate
 from wbc_baselines.ik.kinematics import SOLES, Bodies
 from wbc_baselines.ik.rows import Rows
+from wbc_bench.rotations import yaw_matrix
 
 Array = NDArray[np.float64]
 COLLINEAR = 1e-12  # [m^2] of a triangle whose corners count as lying on one line

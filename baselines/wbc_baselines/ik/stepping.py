@@ -10,12 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from wbc_baselines.ik.arm_servo import damped_step
 from wbc_baselines.ik.config import IKConfig
-from wbc_baselines.ik.geometry import dot, log3, norm, rotate, rotate_back, transposed, yaw_matrix
+from wbc_baselines.ik.geometry import dot, log3, norm, rotate, rotate_back, transposed
 from wbc_baselines.ik.kinematics import SOLES, Kinematics
 from wbc_baselines.ik.rows import Rows
 from wbc_baselines.ik.stance import Stance
+from wbc_bench.robot.kinematics import damped_step
+from wbc_bench.rotations import yaw_matrix
 
 Array = NDArray[np.float64]
 Sides = NDArray[np.int64]  # (N,) 0 for the left foot, 1 for the right one

@@ -48,8 +48,9 @@ def average(paths: Sequence[Path], out: Path) -> None:
                 )
     with torch.no_grad():
         for parts in zip(*((one.actor, one.estimator) for one in found), strict=True):
-            for name, value in parts[0].state_dict().items():
-                values = [part.state_dict()[name].numpy().astype(np.float64) for part in parts]
+            states = [part.state_dict() for part in parts]
+            for name, value in states[0].items():
+                values = [state[name].numpy().astype(np.float64) for state in states]
                 value.copy_(torch.from_numpy(np.mean(values, axis=0)))
     newest = max((one.card for one in found), key=lambda card: card.samples)
     commit, dirty = provenance.commit()

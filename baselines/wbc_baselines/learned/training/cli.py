@@ -227,7 +227,6 @@ class Dagger:
         from wbc_baselines.learned.training.dagger import METHOD, dagger
         from wbc_baselines.learned.training.target_set import read_target_set
         from wbc_bench.episodes.protocol import find_protocol
-        from wbc_bench.files import ensure_file_writable
         from wbc_bench.progress import Progress
 
         for name in ("episodes", "rounds", "updates", "workers"):
@@ -238,9 +237,7 @@ class Dagger:
                 f"--undisturbed-rounds {self.undisturbed_rounds}: valid: 0 to {self.rounds - 1}, "
                 "less than --rounds"
             )
-        if self.path.suffix != ".safetensors":
-            raise TrainingError(f"--path '{self.path}': valid: a name that ends in .safetensors")
-        ensure_file_writable(self.path)
+        _ensure_checkpoint_writable("--path", self.path)
         protocol, _ = find_protocol(self.protocol)
         begun = time.monotonic()
         with Progress("episodes") as progress:
@@ -272,11 +269,8 @@ class Average:
 
     def run(self) -> None:
         from wbc_baselines.learned.policy.average import average
-        from wbc_bench.files import ensure_file_writable
 
-        if self.out.suffix != ".safetensors":
-            raise TrainingError(f"--out '{self.out}': valid: a name that ends in .safetensors")
-        ensure_file_writable(self.out)
+        _ensure_checkpoint_writable("--out", self.out)
         average(self.paths, self.out)
         print(self.out)
 
@@ -327,6 +321,15 @@ Command = (
 DESCRIPTION = """Train the learned controllers.
 
 `wbc-train --version` prints the version."""
+
+
+def _ensure_checkpoint_writable(option: str, path: Path) -> None:
+    """Raises: TrainingError, StoreError: the name or the folder is none for a checkpoint."""
+    from wbc_bench.files import ensure_file_writable
+
+    if path.suffix != ".safetensors":
+        raise TrainingError(f"{option} '{path}': valid: a name that ends in .safetensors")
+    ensure_file_writable(path)
 
 
 def main(arguments: list[str] | None = None) -> None:
